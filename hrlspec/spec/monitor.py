@@ -1,0 +1,78 @@
+"""The monitor: runs a task tree along a trace of labels, inside the jit.
+
+This is the *committed* reading of the abstract graph: the first visit decides. ``docs/semantics.md``
+shows where it differs from the existential semantics of :func:`hrlspec.spec.satisfies`.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from hrlspec.spec.tree import TaskTree
+
+RUNNING = 0
+SATISFIED = 1
+VIOLATED = 2
+
+
+@struct.dataclass
+class TaskState:
+    """Where a task stands: the progression is the subtree at ``node`` without the blocked edges.
+
+    Attributes:
+        node: int32 ``[]``, the current node.
+        blocked: bool ``[N]``, edges out of ``node`` whose ``ensuring`` part was violated.
+        status: int32 ``[]``, ``RUNNING``, ``SATISFIED`` or ``VIOLATED``.
+    """
+
+    node: jax.Array  # int32 []
+    blocked: jax.Array  # bool [N]
+    status: jax.Array  # int32 []
+
+
+def initial(tree: TaskTree) -> TaskState:
+    """The state before the first action: at the root, nothing blocked. No label counts yet."""
+    return TaskState(
+        node=jnp.int32(TaskTree.ROOT),
+        blocked=jnp.zeros(tree.num_nodes, bool),
+        status=jnp.int32(RUNNING),
+    )
+
+
+def open_edges(tree: TaskTree, state: TaskState) -> jax.Array:
+    """Feasible sub-tasks, bool ``[N]``: the unblocked edges out of the current node."""
+    return tree.valid & (tree.parent == state.node) & ~state.blocked
+
+
+def advance(tree: TaskTree, state: TaskState, labels: jax.Array, assigned: jax.Array | int) -> TaskState:
+    """One step of the monitor on the labels that hold in the new environment state.
+
+    Open edges whose ``avoid`` is hit become blocked; then at most one open edge whose ``reach`` holds is
+    taken: the assigned one, else the most specific, else the one of lowest index. With no open edge left
+    the task is violated. A task that is no longer running does not change.
+
+    Args:
+        tree: one task (unbatched; ``vmap`` for more).
+        state: its state.
+        labels: bool ``[P]``, the propositions that hold now.
+        assigned: int32 ``[]``, the node whose edge is pursued, or ``TaskTree.NO_NODE``.
+    """
+    running = state.status == RUNNING
+    candidates = open_edges(tree, state)
+    harmed = (tree.avoid & labels).any(-1)
+    still_open = candidates & ~harmed
+    met = still_open & (~tree.reach | labels).all(-1)
+    num_propositions = tree.reach.shape[-1]
+    preference = tree.reach.sum(-1) + (num_propositions + 1) * (jnp.arange(tree.num_nodes) == assigned)
+    taken = jnp.argmax(jnp.where(met, preference, -1)).astype(jnp.int32)
+    moved = met.any() & running
+    node = jnp.where(moved, taken, state.node)
+    status = jnp.where(
+        moved,
+        jnp.where(tree.accepting[node], SATISFIED, RUNNING),
+        jnp.where(still_open.any(), RUNNING, VIOLATED),
+    )
+    blocked = jnp.where(moved, False, jnp.where(running, state.blocked | (candidates & harmed), state.blocked))
+    return TaskState(node=node, blocked=blocked, status=jnp.where(running, status, state.status).astype(jnp.int32))

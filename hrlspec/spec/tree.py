@@ -1,0 +1,59 @@
+"""The padded task tree: a SPECTRL task as arrays that can be jitted, vmapped and gathered.
+
+Axes: **N** tree nodes, **P** atomic propositions.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+
+@struct.dataclass
+class TaskTree:
+    """A task unfolded into a tree and padded to N nodes (paper, "Sub-task Definition").
+
+    Node 0 is the root; parents come before their children. Every other valid node *is* the edge that
+    enters it, so "edge k" means the edge from ``parent[k]`` to node k. Padding rows are all zero with
+    ``parent = NO_NODE``.
+
+    Attributes:
+        parent: int32 ``[N]``, index of the parent, ``NO_NODE`` for the root and for padding.
+        reach: bool ``[N, P]``, propositions that must hold together to take the edge (p₊).
+        avoid: bool ``[N, P]``, the ``ensuring`` part of the edge: if one of these holds, the edge is blocked.
+        accepting: bool ``[N]``, arriving here satisfies the task. Accepting nodes have no children.
+        valid: bool ``[N]``, false for padding.
+        depth: int32 ``[N]``, edges from the root, 0 for the root and for padding.
+    """
+
+    NO_NODE: ClassVar[int] = -1
+    ROOT: ClassVar[int] = 0
+
+    parent: jax.Array  # int32 [N]
+    reach: jax.Array  # bool [N, P]
+    avoid: jax.Array  # bool [N, P]
+    accepting: jax.Array  # bool [N]
+    valid: jax.Array  # bool [N]
+    depth: jax.Array  # int32 [N]
+
+    @property
+    def num_nodes(self) -> int:
+        """N, the padded number of nodes."""
+        return self.parent.shape[-1]
+
+    @property
+    def num_propositions(self) -> int:
+        """P, the number of atomic propositions."""
+        return self.reach.shape[-1]
+
+
+def subtask_avoid(tree: TaskTree) -> jax.Array:
+    """What each sub-task must avoid, bool ``[N, P]`` (eq. 2): its own avoid and what its siblings reach, minus its reach."""
+    edge = tree.valid & (tree.parent >= 0)
+    siblings = (tree.parent[:, None] == tree.parent[None, :]) & edge[:, None] & edge[None, :]
+    siblings &= ~jnp.eye(tree.num_nodes, dtype=bool)
+    reached_by_siblings = (siblings.astype(jnp.float32) @ tree.reach.astype(jnp.float32)) > 0
+    return tree.avoid | (reached_by_siblings & ~tree.reach)
