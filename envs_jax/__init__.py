@@ -1,0 +1,43 @@
+"""Environments with labels, as pure functions. They know nothing of tasks.
+
+``make("letter")`` gives a preset; keyword arguments override its sizes.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+from envs_jax.base import Box, Discrete, Environment, EnvParams
+from envs_jax.letter import Letter, LetterState
+
+__all__ = ["Box", "Discrete", "EnvParams", "Environment", "Letter", "LetterState", "make", "registered"]
+
+_REGISTRY: dict[str, Callable[..., Environment]] = {
+    "letter": functools.partial(Letter, name="letter"),
+    "letter12": functools.partial(Letter, name="letter12", num_letters=12, num_cells=24),
+}
+
+
+def registered() -> tuple[str, ...]:
+    """Names that :func:`make` knows."""
+    return tuple(_REGISTRY)
+
+
+def make(name: str, **overrides: Any) -> Environment:
+    """The environment of a preset.
+
+    Args:
+        name: one of :func:`registered`.
+        **overrides: sizes that differ from the preset's, for example ``size=9``.
+
+    Raises:
+        ValueError: if the name or a size is unknown, or the sizes do not fit together.
+    """
+    if name not in _REGISTRY:
+        raise ValueError(f"unknown environment {name!r}, expected one of: {', '.join(registered())}")
+    try:
+        return _REGISTRY[name](**overrides)
+    except TypeError as error:
+        raise ValueError(f"environment {name!r}: {error}") from error

@@ -1,0 +1,191 @@
+"""The contract between environments and whatever trains on them.
+
+An environment is a static, hashable value (sizes, names) whose methods are pure functions of arrays. All of
+them are written for one unbatched item: ``vmap`` at the edge. Keys are consumed.
+
+Axes: **P** atomic propositions, **S** states of a finite environment, **A** its actions.
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+Layout = Any
+"""What a reset may vary (where the letters or zones lie): a pytree of arrays."""
+
+State = Any
+"""Everything that changes within an episode and the layout it takes place in: a pytree of arrays."""
+
+Info = dict[str, jax.Array]
+StepResult = tuple[jax.Array, State, jax.Array, jax.Array, jax.Array, Info]
+
+
+@struct.dataclass
+class EnvParams:
+    """What may be traced, so that changing it compiles nothing anew.
+
+    Attributes:
+        horizon: int32 ``[]``, steps after which an episode is truncated.
+    """
+
+    horizon: jax.Array  # int32 []
+
+
+@struct.dataclass
+class Discrete:
+    """A space of the integers ``0 .. n - 1``.
+
+    Attributes:
+        n: the number of elements.
+    """
+
+    n: int = struct.field(pytree_node=False)
+    shape: ClassVar[tuple[int, ...]] = ()
+    dtype: ClassVar[Any] = np.int32
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """A uniform element, int32 ``[]``."""
+        return jax.random.randint(key, (), 0, self.n, jnp.int32)
+
+    def contains(self, x: Any) -> bool:
+        """Whether ``x`` is one integer in range."""
+        value = np.asarray(x)
+        return value.shape == () and np.issubdtype(value.dtype, np.integer) and bool(0 <= value < self.n)
+
+
+@struct.dataclass
+class Box:
+    """A box of real arrays, the same bounds in every coordinate.
+
+    Attributes:
+        low: the least value of a coordinate.
+        high: the largest.
+        shape: the arrays' shape.
+    """
+
+    low: float = struct.field(pytree_node=False)
+    high: float = struct.field(pytree_node=False)
+    shape: tuple[int, ...] = struct.field(pytree_node=False)
+    dtype: ClassVar[Any] = np.float32
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """A uniform element, float32 ``shape``."""
+        return jax.random.uniform(key, self.shape, jnp.float32, self.low, self.high)
+
+    def contains(self, x: Any) -> bool:
+        """Whether ``x`` has the shape and lies within the bounds (bounds included)."""
+        value = np.asarray(x)
+        return value.shape == self.shape and bool(np.all((value >= self.low) & (value <= self.high)))
+
+
+class Environment(abc.ABC):
+    """A world with labels. Rewards come from tasks, so environments pay 0 and end episodes by truncation only.
+
+    Attributes:
+        name: the preset's name.
+        propositions: names of the P propositions, in the order of ``labels``.
+        horizon: steps after which an episode is truncated, unless ``params`` says otherwise.
+        observation_shape: shape of an observation.
+    """
+
+    name: str
+    horizon: int
+
+    @property
+    @abc.abstractmethod
+    def propositions(self) -> tuple[str, ...]:
+        """Names of the P propositions, in the order of ``labels``."""
+
+    @property
+    @abc.abstractmethod
+    def observation_shape(self) -> tuple[int, ...]:
+        """Shape of an observation (float32)."""
+
+    @property
+    @abc.abstractmethod
+    def observation_space(self) -> Box:
+        """Where observations lie."""
+
+    @property
+    @abc.abstractmethod
+    def action_space(self) -> Discrete | Box:
+        """Where actions lie."""
+
+    @property
+    def num_propositions(self) -> int:
+        """P."""
+        return len(self.propositions)
+
+    @property
+    def default_params(self) -> EnvParams:
+        """The traced parameters as the preset has them."""
+        return EnvParams(horizon=jnp.int32(self.horizon))
+
+    @abc.abstractmethod
+    def resample_layout(self, key: jax.Array, layout: Layout, needed: jax.Array, params: EnvParams) -> Layout:
+        """A layout that differs from ``layout`` where ``needed`` (bool ``[]``) is true, else ``layout`` itself.
+
+        Written so that under ``vmap`` a step at which no episode ends costs (nearly) nothing.
+        """
+
+    @abc.abstractmethod
+    def sample_layout(self, key: jax.Array, params: EnvParams) -> Layout:
+        """A random layout; ``vmap`` over keys for a pool."""
+
+    @abc.abstractmethod
+    def reset_to(self, layout: Layout, key: jax.Array, params: EnvParams) -> tuple[jax.Array, State]:
+        """Starts an episode in a given layout: ``(observation, state)``."""
+
+    @abc.abstractmethod
+    def step_env(self, key: jax.Array, state: State, action: jax.Array, params: EnvParams) -> StepResult:
+        """One raw step, without auto-reset.
+
+        Returns:
+            ``(observation, state, reward, terminated, truncated, info)``: reward float32 ``[]``, ``terminated``
+            and ``truncated`` bool ``[]``. Values bootstrap on truncation, never on termination.
+        """
+
+    @abc.abstractmethod
+    def labels(self, state: State, params: EnvParams) -> jax.Array:
+        """The propositions that hold in a state, bool ``[P]``."""
+
+    @abc.abstractmethod
+    def observation(self, state: State, params: EnvParams) -> jax.Array:
+        """What the agent sees, float32 ``observation_shape``."""
+
+    @abc.abstractmethod
+    def proposition_view(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Splits an observation into what belongs to each proposition and what is shared by all.
+
+        Returns:
+            ``(per_proposition, shared)``: float32 ``[P, ...]`` and float32 ``[F0]`` (may be empty).
+        """
+
+    def reset(self, key: jax.Array, params: EnvParams) -> tuple[jax.Array, State]:
+        """Starts an episode in a new layout: ``(observation, state)``."""
+        layout_key, start_key = jax.random.split(key)
+        return self.reset_to(self.sample_layout(layout_key, params), start_key, params)
+
+    def step(self, key: jax.Array, state: State, action: jax.Array, params: EnvParams) -> StepResult:
+        """:meth:`step_env` with auto-reset into a layout that differs from the one that ended.
+
+        Where the episode ended, the returned observation and state are the next episode's first ones, and
+        ``info["final_observation"]`` is what the step led to; elsewhere it equals the observation.
+        """
+        step_key, layout_key, start_key = jax.random.split(key, 3)
+        final_observation, stepped, reward, terminated, truncated, info = self.step_env(
+            step_key, state, action, params
+        )
+        done = terminated | truncated
+        layout = self.resample_layout(layout_key, stepped.layout, done, params)
+        fresh_observation, fresh = self.reset_to(layout, start_key, params)
+        observation = jnp.where(done, fresh_observation, final_observation)
+        state = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, stepped)
+        info = {**info, "final_observation": final_observation}
+        return observation, state, reward, terminated, truncated, info
