@@ -21,6 +21,9 @@ NO_LETTER = -1
 MOVES = np.array([[-1, 0], [1, 0], [0, -1], [0, 1]], np.int32)
 """Row and column offsets of the actions: up, down, left, right."""
 
+MOST_ROWS = 32
+"""A row of cells is kept in one 32-bit word while layouts are checked."""
+
 LEAST_ACCEPTANCE = 0.01
 """Sizes are refused when fewer random layouts than this share have all letters reachable."""
 
@@ -68,8 +71,8 @@ class Letter(Environment):
     name: str = "letter"
 
     def __post_init__(self) -> None:
-        if self.size < 2:
-            raise ValueError(f"Letter: size is {self.size}, expected at least 2")
+        if not 2 <= self.size <= MOST_ROWS:
+            raise ValueError(f"Letter: size is {self.size}, expected 2 to {MOST_ROWS}")
         if not 1 <= self.num_letters <= len(string.ascii_lowercase):
             raise ValueError(f"Letter: num_letters is {self.num_letters}, expected 1 to 26")
         if self.num_cells < self.num_letters or self.num_cells % self.num_letters:
@@ -194,35 +197,46 @@ class Letter(Environment):
         The rank of a cell among random numbers says which letter it bears: comparisons only, since a sort
         inside a vmapped loop is slow on a CPU.
         """
-        bits = jax.random.bits(key, (self.size**2 - 1,), jnp.uint32)
-        index = np.arange(bits.shape[0])
-        before = (bits[None, :] < bits[:, None]) | ((bits[None, :] == bits[:, None]) & (index[None, :] < index[:, None]))
-        rank = before.sum(-1, dtype=jnp.int32)
+        index = np.arange(self.size**2 - 1, dtype=np.uint32)
+        low_bits = np.uint32(2 ** int(index[-1]).bit_length() - 1)
+        # The cell's index in the low bits makes the numbers distinct.
+        drawn = (jax.random.bits(key, index.shape, jnp.uint32) & ~low_bits) | index
+        rank = (drawn[None, :] < drawn[:, None]).sum(-1, dtype=jnp.int32)
         letter = jnp.where(rank < self.num_cells, rank // (self.num_cells // self.num_letters), NO_LETTER)
         return jnp.concatenate([jnp.full(1, NO_LETTER), letter]).reshape(self.size, self.size).astype(jnp.int8)
 
     def _all_reachable(self, layout: jax.Array) -> jax.Array:
         """Whether each letter has a cell next to those reachable from (0, 0) over letter-free cells, bool ``[]``."""
-        free = layout == NO_LETTER
-        start = jnp.zeros_like(free).at[0, 0].set(True)
+        # A row is one word, a cell one bit: the fill is a handful of integer operations on n words.
+        bit = jnp.uint32(1) << jnp.arange(self.size, dtype=jnp.uint32)
+        free = jnp.where(layout == NO_LETTER, bit, jnp.uint32(0)).sum(-1, dtype=jnp.uint32)
+        start = jnp.zeros(self.size, jnp.uint32).at[0].set(1)
+
+        def spread(rows: jax.Array) -> jax.Array:
+            left = ((rows << 1) | (rows >> (self.size - 1))) & jnp.uint32(2**self.size - 1)
+            right = (rows >> 1) | ((rows & 1) << (self.size - 1))
+            return rows | left | right | jnp.roll(rows, 1) | jnp.roll(rows, -1)
 
         def grow(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             reached, _ = carry
-            # Two rounds a turn: the test for a fixed point costs as much as a round.
-            wider = _with_neighbours(reached) & free
-            return _with_neighbours(wider) & free, reached
+            # Four rounds a turn: the test for a fixed point costs more than a round.
+            wider = reached
+            for _ in range(4):
+                wider = spread(wider) & free
+            return wider, reached
 
-        reached, _ = jax.lax.while_loop(lambda carry: (carry[0] != carry[1]).any(), grow, (start, ~start))
-        touched = _with_neighbours(reached)
-        present = (layout[..., None] == jnp.arange(self.num_letters)) & touched[..., None]
-        return present.any((0, 1)).all()
+        reached, _ = jax.lax.while_loop(
+            lambda carry: (carry[0] != carry[1]).any(), grow, (start, jnp.zeros_like(start))
+        )
+        touched = (spread(reached)[:, None] & bit) != 0
+        letters = jnp.arange(self.num_letters, dtype=layout.dtype)
+        return ((layout[..., None] == letters) & touched[..., None]).any((0, 1)).all()
 
 
-def _with_neighbours(cells: Any) -> Any:
-    """The given cells and those one move away, bool ``[..., n, n]`` (numpy or JAX)."""
-    xp = np if isinstance(cells, np.ndarray) else jnp
-    rows = xp.roll(cells, 1, -2) | xp.roll(cells, -1, -2)
-    columns = xp.roll(cells, 1, -1) | xp.roll(cells, -1, -1)
+def _with_neighbours(cells: np.ndarray) -> np.ndarray:
+    """The given cells and those one move away, bool ``[..., n, n]``."""
+    rows = np.roll(cells, 1, -2) | np.roll(cells, -1, -2)
+    columns = np.roll(cells, 1, -1) | np.roll(cells, -1, -1)
     return cells | rows | columns
 
 
