@@ -10,9 +10,21 @@ from collections.abc import Callable
 from typing import Any
 
 from envs_jax.base import Box, Discrete, Environment, EnvParams
+from envs_jax.layouts import load_layouts, save_layouts
 from envs_jax.letter import Letter, LetterState
 
-__all__ = ["Box", "Discrete", "EnvParams", "Environment", "Letter", "LetterState", "make", "registered"]
+__all__ = [
+    "Box",
+    "Discrete",
+    "EnvParams",
+    "Environment",
+    "Letter",
+    "LetterState",
+    "load_layouts",
+    "make",
+    "registered",
+    "save_layouts",
+]
 
 _REGISTRY: dict[str, Callable[..., Environment]] = {
     "letter": functools.partial(Letter, name="letter"),

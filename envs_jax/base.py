@@ -139,6 +139,10 @@ class Environment(abc.ABC):
         """A random layout; ``vmap`` over keys for a pool."""
 
     @abc.abstractmethod
+    def check_layout(self, layout: Layout) -> None:
+        """Raises ``ValueError`` if a given layout (numpy) cannot be used; shapes and dtypes are taken as right."""
+
+    @abc.abstractmethod
     def reset_to(self, layout: Layout, key: jax.Array, params: EnvParams) -> tuple[jax.Array, State]:
         """Starts an episode in a given layout: ``(observation, state)``."""
 
@@ -179,9 +183,7 @@ class Environment(abc.ABC):
         ``info["final_observation"]`` is what the step led to; elsewhere it equals the observation.
         """
         step_key, layout_key, start_key = jax.random.split(key, 3)
-        final_observation, stepped, reward, terminated, truncated, info = self.step_env(
-            step_key, state, action, params
-        )
+        final_observation, stepped, reward, terminated, truncated, info = self.step_env(step_key, state, action, params)
         done = terminated | truncated
         layout = self.resample_layout(layout_key, stepped.layout, done, params)
         fresh_observation, fresh = self.reset_to(layout, start_key, params)

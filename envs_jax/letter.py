@@ -77,7 +77,7 @@ class Letter(Environment):
             raise ValueError(f"Letter: num_letters is {self.num_letters}, expected 1 to 26")
         if self.num_cells < self.num_letters or self.num_cells % self.num_letters:
             raise ValueError(
-                f"Letter: num_cells is {self.num_cells}, expected a positive multiple of num_letters = {self.num_letters}"
+                f"Letter: num_cells is {self.num_cells}, expected a multiple of num_letters = {self.num_letters}"
             )
         if self.num_cells >= self.size**2:
             raise ValueError(
@@ -121,10 +121,11 @@ class Letter(Environment):
         nothing = jnp.full((self.size, self.size), NO_LETTER, jnp.int8)
         return self.resample_layout(key, nothing, jnp.bool_(True), params)
 
-    def resample_layout(
-        self, key: jax.Array, layout: jax.Array, needed: jax.Array, params: EnvParams
-    ) -> jax.Array:
-        """A random layout other than ``layout`` where ``needed``, else ``layout``. No loop turns where no lane needs one."""
+    def resample_layout(self, key: jax.Array, layout: jax.Array, needed: jax.Array, params: EnvParams) -> jax.Array:
+        """A random layout other than ``layout`` where ``needed``, else ``layout``.
+
+        The loop starts out finished where nothing is needed: a vmapped step at which no episode ends draws nothing.
+        """
         del params
         previous = layout
 
@@ -135,6 +136,18 @@ class Letter(Environment):
             return key, candidate, self._all_reachable(candidate) & (candidate != previous).any()
 
         return jax.lax.while_loop(lambda carry: ~carry[2], draw, (key, layout, ~needed))[1]
+
+    def check_layout(self, layout: np.ndarray) -> None:
+        """Raises ``ValueError`` unless cells hold known letters and (0, 0) holds none.
+
+        Letter counts and reachability are not asked of given layouts: a hand-made one may break them on purpose.
+        """
+        if ((layout < NO_LETTER) | (layout >= self.num_letters)).any():
+            raise ValueError(
+                f"letter numbers from {layout.min()} to {layout.max()}, expected -1 to {self.num_letters - 1}"
+            )
+        if layout[0, 0] != NO_LETTER:
+            raise ValueError("the start cell (0, 0) bears a letter")
 
     def reset_to(self, layout: jax.Array, key: jax.Array, params: EnvParams) -> tuple[jax.Array, LetterState]:
         """Starts at (0, 0) in a given layout (int ``[n, n]``)."""
@@ -173,7 +186,10 @@ class Letter(Environment):
         return jnp.concatenate([letters, agent], axis=-1).astype(jnp.float32)
 
     def proposition_view(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Each letter's plane, float32 ``[P, n, n]``; nothing is shared (float32 ``[0]``): the agent is in the middle."""
+        """Each letter's plane, float32 ``[P, n, n]``; nothing is shared (float32 ``[0]``).
+
+        The agent's own plane is the same always, so it is left out.
+        """
         return jnp.moveaxis(observation[..., : self.num_letters], -1, 0), jnp.zeros(0, jnp.float32)
 
     def transition_table(self, layout: Any, params: EnvParams) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -1,0 +1,152 @@
+"""What every registered environment must do, whatever its world."""
+
+from __future__ import annotations
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs_jax
+
+NUM = 8
+
+
+@pytest.fixture(scope="module", params=envs_jax.registered())
+def env(request: pytest.FixtureRequest) -> envs_jax.Environment:
+    return envs_jax.make(request.param)
+
+
+def _same(left: object, right: object) -> bool:
+    return all(jax.tree.leaves(jax.tree.map(np.array_equal, left, right)))
+
+
+def _rollout(env: envs_jax.Environment, params: envs_jax.EnvParams, num_steps: int, seed: int = 0):
+    """States before, and results of, ``num_steps`` random auto-reset steps of NUM environments (axes T, E)."""
+
+    def one(key: jax.Array):
+        key, reset_key = jax.random.split(key)
+        _, state = env.reset(reset_key, params)
+
+        def body(state, key):
+            action_key, step_key = jax.random.split(key)
+            result = env.step(step_key, state, env.action_space.sample(action_key), params)
+            return result[1], (state, result)
+
+        return jax.lax.scan(body, state, jax.random.split(key, num_steps))[1]
+
+    return jax.jit(jax.vmap(one, out_axes=1))(jax.random.split(jax.random.key(seed), NUM))
+
+
+def test_registry_refuses_what_it_does_not_know() -> None:
+    with pytest.raises(ValueError, match=r"unknown environment 'lettre'.*letter12"):
+        envs_jax.make("lettre")
+    with pytest.raises(ValueError, match=r"'letter'.*sizes"):
+        envs_jax.make("letter", sizes=3)
+
+
+def test_environments_are_static_values(env: envs_jax.Environment) -> None:
+    assert env == envs_jax.make(env.name)
+    assert hash(env) == hash(envs_jax.make(env.name))
+    assert len(set(env.propositions)) == env.num_propositions > 0
+
+
+def test_shapes_dtypes_and_spaces(env: envs_jax.Environment) -> None:
+    params = env.default_params
+    observation, state = jax.jit(env.reset)(jax.random.key(0), params)
+    result = jax.jit(env.step)(jax.random.key(1), state, env.action_space.sample(jax.random.key(2)), params)
+    for seen in (observation, result[0], result[5]["final_observation"]):
+        chex.assert_shape(seen, env.observation_shape)
+        chex.assert_type(seen, jnp.float32)
+        assert env.observation_space.contains(seen)
+    chex.assert_trees_all_equal_shapes_and_dtypes(state, result[1])
+    chex.assert_shape(result[2:5], ())
+    chex.assert_type(result[2:5], [jnp.float32, bool, bool])
+    chex.assert_shape(env.labels(state, params), (env.num_propositions,))
+    chex.assert_type(env.labels(state, params), bool)
+    per_proposition, shared = env.proposition_view(observation)
+    assert per_proposition.shape[0] == env.num_propositions
+    assert shared.ndim == 1
+
+
+def test_spaces_contain_what_they_sample_and_nothing_else(env: envs_jax.Environment) -> None:
+    for space in (env.observation_space, env.action_space):
+        sample = space.sample(jax.random.key(0))
+        assert space.contains(sample)
+        assert sample.shape == space.shape
+        assert sample.dtype == space.dtype
+        assert not space.contains(np.full((*space.shape, 1), 0))
+        assert not space.contains(np.asarray(sample) + 1000)
+
+
+def test_truncation_is_not_termination(env: envs_jax.Environment) -> None:
+    params = env.default_params.replace(horizon=jnp.int32(5))
+    _, state = jax.jit(env.reset)(jax.random.key(0), params)
+    step_env = jax.jit(env.step_env)
+    for t in range(1, 6):
+        action = env.action_space.sample(jax.random.key(t))
+        _, state, reward, terminated, truncated, _ = step_env(jax.random.key(t), state, action, params)
+        assert bool(truncated) == (t == 5)
+        assert not bool(terminated)
+        assert float(reward) == 0.0
+
+
+def test_auto_reset_keeps_the_final_observation_and_never_repeats_a_layout(env: envs_jax.Environment) -> None:
+    params = env.default_params.replace(horizon=jnp.int32(4))
+    step_env, reset_to = jax.jit(env.step_env), jax.jit(env.reset_to)
+    states, (observations, after, _, terminated, truncated, info) = _rollout(env, params, 14)
+    assert not terminated.any()
+    assert np.array_equal(truncated, np.arange(1, 15)[:, None] % 4 + np.zeros(NUM) == 0)
+    for t, e in np.ndindex(14, NUM):
+        before, now = jax.tree.map(lambda x, t=t, e=e: x[t, e], (states, after))
+        seen, final = observations[t, e], info["final_observation"][t, e]
+        if not truncated[t, e]:
+            assert np.array_equal(seen, final)
+            assert _same(before.layout, now.layout)
+            continue
+        assert not _same(before.layout, now.layout)
+        fresh = reset_to(now.layout, jax.random.key(0), params)
+        assert _same((seen, now), fresh)
+        ended = [step_env(jax.random.key(0), before, action, params)[0] for action in range(env.action_space.n)]
+        assert any(np.array_equal(final, one) for one in ended)
+
+
+def test_reset_to_a_given_layout(env: envs_jax.Environment) -> None:
+    params = env.default_params
+    layout = jax.jit(env.sample_layout)(jax.random.key(3), params)
+    observation, state = env.reset_to(layout, jax.random.key(4), params)
+    assert _same(state.layout, layout)
+    assert np.array_equal(observation, env.observation(state, params))
+
+
+def test_a_batch_equals_its_items(env: envs_jax.Environment) -> None:
+    params = env.default_params
+    keys = jax.random.split(jax.random.key(5), NUM)
+    reset = jax.jit(env.reset)
+    batch = jax.jit(jax.vmap(env.reset, (0, None)))(keys, params)
+    for e in range(NUM):
+        assert _same(jax.tree.map(lambda x, e=e: x[e], batch), reset(keys[e], params))
+
+
+def test_nothing_recompiles(env: envs_jax.Environment) -> None:
+    chex.clear_trace_counter()
+    reset = jax.jit(chex.assert_max_traces(env.reset, n=1))
+    step = jax.jit(chex.assert_max_traces(env.step, n=1))
+    for horizon in (3, 7):
+        params = env.default_params.replace(horizon=jnp.int32(horizon))
+        _, state = reset(jax.random.key(horizon), params)
+        for t in range(8):
+            action = env.action_space.sample(jax.random.key(t))
+            _, state, *_ = step(jax.random.key(t), state, action, params)
+
+
+def test_a_resampled_layout_differs_only_where_needed(env: envs_jax.Environment) -> None:
+    params = env.default_params
+    layout = jax.jit(env.sample_layout)(jax.random.key(6), params)
+    resample = jax.jit(env.resample_layout)
+    for seed in range(5):
+        assert _same(resample(jax.random.key(seed), layout, jnp.bool_(False), params), layout)
+        assert not _same(resample(jax.random.key(seed), layout, jnp.bool_(True), params), layout)
+    # The very draw that gave this layout must be passed over.
+    assert not _same(resample(jax.random.key(6), layout, jnp.bool_(True), params), layout)
