@@ -207,6 +207,10 @@ class Letter(Environment):
         labels = jnp.asarray(layout).reshape(-1, 1) == jnp.arange(self.num_letters)
         return jnp.asarray(_successors(self.size)), labels, jnp.int32(0)
 
+    def graph_state(self, state: LetterState) -> jax.Array:
+        """The agent's cell as a state of :meth:`transition_table`, int32 ``[]``."""
+        return state.position[0] * self.size + state.position[1]
+
     def _place_letters(self, key: jax.Array) -> jax.Array:
         """Letters on uniformly drawn cells other than (0, 0), int8 ``[n, n]``.
 

@@ -155,6 +155,7 @@ def test_transition_table_is_the_environment() -> None:
     _, first = env.reset_to(layout, jax.random.key(0), params)
     for cell in range(25):
         state = first.replace(position=jnp.array(divmod(cell, 5), jnp.int32))
+        assert int(env.graph_state(state)) == cell
         np.testing.assert_array_equal(labels[cell], env.labels(state, params))
         for action in range(4):
             _, after, *_ = step_env(jax.random.key(0), state, jnp.int32(action), params)
