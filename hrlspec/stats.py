@@ -1,0 +1,190 @@
+"""Estimates with intervals, for a handful of seeds and many episodes.
+
+Axes: **S** seeds (or runs), **M** tasks. Episodes of one task resemble each other more than those of two, so rates and
+means over episodes accept ``tasks`` and widen their intervals accordingly. The aggregates over seeds are those of
+Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice" (2021).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import scipy.special
+from numpy.typing import ArrayLike
+
+Statistic = Callable[[np.ndarray], float]
+
+
+class Interval(NamedTuple):
+    """An estimate and the bounds of its confidence interval; a bound that cannot be had is NaN."""
+
+    estimate: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.estimate:.3f} [{self.low:.3f}, {self.high:.3f}]"
+
+
+def mean_interval(values: ArrayLike, *, tasks: ArrayLike | None = None, confidence: float = 0.95) -> Interval:
+    """The mean with Student's t interval, which is honest for three seeds, where a normal interval is not.
+
+    Args:
+        values: numbers ``[n]``, such as returns; finite.
+        tasks: ``[n]``, which task each value belongs to. The interval then rests on the variation between tasks
+            (cluster-robust variance) with one degree of freedom less than there are tasks.
+        confidence: coverage of the interval.
+
+    Returns:
+        All NaN without values; NaN bounds with a single value or task.
+    """
+    sample = _finite(values, 1)
+    if not sample.size:
+        return Interval(np.nan, np.nan, np.nan)
+    groups = _groups(sample, tasks)
+    mean, count = float(sample.mean()), int(groups.max()) + 1
+    if count == 1:
+        return Interval(mean, np.nan, np.nan)
+    half = float(scipy.special.stdtrit(count - 1, (1 + _checked(confidence)) / 2)) * _standard_error(sample, groups)
+    return Interval(mean, mean - half, mean + half)
+
+
+def rate_interval(outcomes: ArrayLike, *, tasks: ArrayLike | None = None, confidence: float = 0.95) -> Interval:
+    """A success rate with Wilson's interval, which stays inside [0, 1] and has a width at 0 and 1 too.
+
+    Args:
+        outcomes: bool ``[n]``, or zeros and ones.
+        tasks: ``[n]``, which task each outcome belongs to. The number of episodes then counts only as many as would be
+            as informative if they were independent. Where all outcomes agree nothing shows how alike they are, and
+            each episode counts in full.
+        confidence: coverage of the interval.
+
+    Returns:
+        Without outcomes ``(NaN, 0, 1)``.
+    """
+    sample = _finite(outcomes, 1)
+    if not np.isin(sample, (0, 1)).all():
+        raise ValueError("outcomes of a rate are 0 or 1")
+    z = float(scipy.special.ndtri((1 + _checked(confidence)) / 2))
+    if not sample.size:
+        return Interval(np.nan, 0.0, 1.0)
+    rate, trials = float(sample.mean()), float(sample.size)
+    groups = _groups(sample, tasks)
+    variance = rate * (1 - rate)
+    if tasks is not None and variance > 0 and groups.max() > 0:
+        trials = min(trials, variance / max(_standard_error(sample, groups) ** 2, 1e-12))
+    centre = (rate + z**2 / (2 * trials)) / (1 + z**2 / trials)
+    half = z / (1 + z**2 / trials) * np.sqrt(variance / trials + z**2 / (4 * trials**2))
+    # At 0 and 1 one bound is the rate itself, up to rounding.
+    return Interval(rate, min(max(centre - half, 0.0), rate), max(min(centre + half, 1.0), rate))
+
+
+def interquartile_mean(scores: ArrayLike) -> float:
+    """The mean of the middle half of all scores, of any shape: robust like the median, and wastes less."""
+    ordered = np.sort(np.asarray(scores, float), axis=None)
+    cut = ordered.size // 4
+    return float(ordered[cut : ordered.size - cut].mean()) if ordered.size else float("nan")
+
+
+def stratified_bootstrap(
+    scores: ArrayLike,
+    statistic: Statistic = interquartile_mean,
+    *,
+    resamples: int = 2000,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> Interval:
+    """A statistic over seeds and tasks with its percentile bootstrap interval.
+
+    Seeds are drawn with replacement within each task, so the tasks stay fixed: the interval says what other seeds would
+    give on the same tasks.
+
+    Args:
+        scores: ``[S, M]``, or ``[S]`` for one task.
+        statistic: of an array ``[S, M]``.
+        resamples: how many bootstrap samples.
+        confidence: coverage of the interval.
+        seed: of the resampling, so that the same scores give the same interval.
+    """
+    table = _table(scores)
+    rng = np.random.default_rng(seed)
+    draws = np.array([statistic(_resample(table, rng)) for _ in range(resamples)])
+    return Interval(float(statistic(table)), *_percentiles(draws, confidence))
+
+
+def probability_of_improvement(
+    ours: ArrayLike, theirs: ArrayLike, *, resamples: int = 2000, confidence: float = 0.95, seed: int = 0
+) -> Interval:
+    """The probability that a run of one method beats a run of another on a task drawn at random; ties count half.
+
+    Args:
+        ours: ``[S, M]``, or ``[S]`` for one task.
+        theirs: ``[S', M]``, on the same tasks in the same order.
+        resamples: how many bootstrap samples, stratified by task.
+        confidence: coverage of the interval.
+        seed: of the resampling.
+    """
+    first, second = _table(ours), _table(theirs)
+    if first.shape[1] != second.shape[1]:
+        raise ValueError(f"both methods need the same tasks, found {first.shape[1]} and {second.shape[1]}")
+
+    def improvement(x: np.ndarray, y: np.ndarray) -> float:
+        return float((np.sign(x[:, None] - y[None]) + 1).mean() / 2)
+
+    rng = np.random.default_rng(seed)
+    draws = np.array([improvement(_resample(first, rng), _resample(second, rng)) for _ in range(resamples)])
+    return Interval(improvement(first, second), *_percentiles(draws, confidence))
+
+
+def _standard_error(sample: np.ndarray, groups: np.ndarray) -> float:
+    """Of the mean, from the groups' sums of deviations; with groups of one the usual standard error."""
+    sums = np.bincount(groups, weights=sample - sample.mean())
+    count = len(sums)
+    return float(np.sqrt(count / (count - 1) * (sums**2).sum()) / sample.size)
+
+
+def _groups(sample: np.ndarray, tasks: ArrayLike | None) -> np.ndarray:
+    """Consecutive numbers of the groups, int ``[n]``; every value is its own group without tasks."""
+    if tasks is None:
+        return np.arange(sample.size)
+    names = np.asarray(tasks)
+    if names.shape != sample.shape:
+        raise ValueError(f"tasks has the shape {names.shape}, expected {sample.shape}")
+    return np.unique(names, return_inverse=True)[1]
+
+
+def _finite(values: ArrayLike, dimensions: int) -> np.ndarray:
+    sample = np.asarray(values, float)
+    if sample.ndim != dimensions:
+        raise ValueError(f"expected {dimensions} axes, found the shape {sample.shape}")
+    if not np.isfinite(sample).all():
+        raise ValueError("found a value that is not finite")
+    return sample
+
+
+def _table(scores: ArrayLike) -> np.ndarray:
+    """Scores as ``[S, M]``."""
+    table = np.asarray(scores, float)
+    table = _finite(table[:, None] if table.ndim == 1 else table, 2)
+    if not table.size:
+        raise ValueError(f"expected scores of at least one seed and one task, found the shape {table.shape}")
+    return table
+
+
+def _resample(table: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    rows = rng.integers(table.shape[0], size=table.shape)
+    return np.take_along_axis(table, rows, axis=0)
+
+
+def _percentiles(draws: np.ndarray, confidence: float) -> tuple[float, float]:
+    tail = (1 - _checked(confidence)) / 2
+    low, high = np.quantile(draws, [tail, 1 - tail])
+    return float(low), float(high)
+
+
+def _checked(confidence: float) -> float:
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence is {confidence}, expected a number between 0 and 1")
+    return confidence
