@@ -1,0 +1,44 @@
+"""What the project promises about itself: commands, packages, versions."""
+
+from __future__ import annotations
+
+import os
+import re
+import tomllib
+from pathlib import Path
+
+import hrlspec.version
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+def test_continuous_integration_runs_the_test_command_of_the_readme() -> None:
+    (command,) = re.findall(r"^.*-m pytest.*$", (ROOT / "README.md").read_text(), re.MULTILINE)
+    assert command.startswith('python3 -m venv .venv && .venv/bin/pip install -q -e ".[test]" && ')
+    tests = command.split(" && ")[-1].removeprefix(".venv/bin/")
+    script = (ROOT / ".ci" / "run").read_text()
+    assert re.search(rf"^{re.escape(tests)}\b", script, re.MULTILINE)
+    # It installs what the linters need on top of what the tests need.
+    assert re.search(r'^pip install .*-e "\.\[dev\]"$', script, re.MULTILINE)
+    assert "hrlspec[test]" in PROJECT["project"]["optional-dependencies"]["dev"]
+    assert os.access(ROOT / ".ci" / "run", os.X_OK)
+
+
+def test_packages_are_typed_and_shipped() -> None:
+    packages = PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
+    assert packages == ["hrlspec", "envs_jax", "experiments"]
+    assert all((ROOT / package / "py.typed").exists() for package in packages)
+
+
+def test_dependencies_have_lower_bounds_only() -> None:
+    extras = PROJECT["project"]["optional-dependencies"].values()
+    requirements = [*PROJECT["project"]["dependencies"], *(line for extra in extras for line in extra)]
+    external = [line for line in requirements if not line.startswith("hrlspec[")]
+    assert all(re.fullmatch(r"[A-Za-z-]+>=[0-9.]+", line) for line in external), external
+
+
+def test_the_version_is_in_the_changelog() -> None:
+    changelog = (ROOT / "CHANGELOG.md").read_text()
+    assert re.fullmatch(r"\d+\.\d+\.\d+", hrlspec.version.__version__)
+    assert "## Unreleased" in changelog or f"## {hrlspec.version.__version__}" in changelog
