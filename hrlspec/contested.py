@@ -8,6 +8,7 @@ Axes: **L** layouts, **S** graph states, **N** tree nodes, **P** atomic proposit
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -184,10 +185,9 @@ def contested_suite(
     params = env.default_params if params is None else params
     wanted = num_cases // 2
     kept: dict[bool, list[tuple[Any, ...]]] = {True: [], False: []}
-    sample = jax.jit(jax.vmap(env.sample_layout, (0, None)))
     pairs = _pairs(env.num_propositions)
     for draw_key in jax.random.split(key, most_rounds):
-        layouts = jax.tree.map(np.asarray, sample(jax.random.split(draw_key, 512), params))
+        layouts = jax.tree.map(np.asarray, _sample_layouts(env, jax.random.split(draw_key, 512), params))
         graph = tabulate(env, layouts, params)
         for part in np.array_split(np.arange(512), 16):
             tree = two_step_task(*next(pairs), env.num_propositions, max_nodes)
@@ -204,6 +204,12 @@ def contested_suite(
             return ContestedSuite(layouts, tasks, *(np.stack([case[i] for case in cases]) for i in range(2, 6)))
     found_so_far = f"{len(kept[True])} contested and {len(kept[False])} control cases"
     raise ValueError(f"{env.name}: only {found_so_far} in {512 * most_rounds} layouts, {wanted} of each are wanted")
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _sample_layouts(env: Any, keys: jax.Array, params: Any) -> Any:
+    """One layout for each key."""
+    return jax.vmap(env.sample_layout, (0, None))(keys, params)
 
 
 def _pairs(num_propositions: int) -> Iterator[tuple[int, int]]:
