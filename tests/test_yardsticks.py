@@ -23,9 +23,14 @@ LETTER = envs_jax.make("letter")
 
 
 @functools.cache
-def _letter_graph(number: int) -> solver.Graph:
-    keys = jax.random.split(jax.random.key(0), number)
+def _pool() -> solver.Graph:
+    keys = jax.random.split(jax.random.key(0), 3000)
     return solver.tabulate(LETTER, jax.jit(jax.vmap(LETTER.sample_layout, (0, None)))(keys, LETTER.default_params))
+
+
+def _letter_graph(number: int) -> solver.Graph:
+    """The first of 3,000 random layouts."""
+    return _pool()[:number]
 
 
 def _random_graph(rng: np.random.Generator, num_layouts: int) -> solver.Graph:
