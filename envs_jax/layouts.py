@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
 import pathlib
@@ -79,6 +80,7 @@ def load_layouts(path: str | os.PathLike[str], env: Environment) -> Layout:
     return jax.tree.unflatten(structure, leaves)
 
 
+@functools.cache
 def _expected(env: Environment) -> Any:
     """Shapes and dtypes of one layout."""
     return jax.eval_shape(env.sample_layout, jax.random.key(0), env.default_params)

@@ -158,7 +158,7 @@ def _assert_matches_brute_force(
             assert (found if found <= horizon else np.inf, returns_by_branch[i, c]) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_letter_against_brute_force(seed: int) -> None:
     rng = np.random.default_rng(seed)
     tree = random_tree(rng, num_nodes=6, num_propositions=3)
@@ -168,7 +168,7 @@ def test_letter_against_brute_force(seed: int) -> None:
     _assert_matches_brute_force(_letter_world, list(layouts), graph, tree, machine, horizon=9)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(8))
 def test_any_graph_against_brute_force(seed: int) -> None:
     """Several labels at once: edges met together, goals beside harm, bonuses armed and barred in one step."""
     rng = np.random.default_rng(100 + seed)
@@ -204,9 +204,9 @@ def test_all_action_sequences_of_a_tiny_world() -> None:
 
     play_all = jax.jit(jax.vmap(play, (None, None, 0)))
     rng, seen = np.random.default_rng(7), []
-    layouts = _layouts(SMALL, 8, 7)
+    layouts = _layouts(SMALL, 6, 7)
     graph = solver.tabulate(SMALL, layouts)
-    for i in range(8):
+    for i in range(6):
         # One letter a cell and siblings that differ: what is assigned makes no difference.
         tree = random_tree(rng, num_nodes=5, num_propositions=3, distinct=True)
         steps, returns = play_all(layouts[i], jax.tree.map(jnp.asarray, tree), sequences)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -16,6 +20,12 @@ NUM = 8
 @pytest.fixture(scope="module", params=envs_jax.registered())
 def env(request: pytest.FixtureRequest) -> envs_jax.Environment:
     return envs_jax.make(request.param)
+
+
+@functools.cache
+def _jitted(env: envs_jax.Environment, method: str) -> Callable[..., Any]:
+    """The method, compiled once for all tests."""
+    return jax.jit(getattr(env, method))
 
 
 def _same(left: object, right: object) -> bool:
@@ -54,8 +64,8 @@ def test_environments_are_static_values(env: envs_jax.Environment) -> None:
 
 def test_shapes_dtypes_and_spaces(env: envs_jax.Environment) -> None:
     params = env.default_params
-    observation, state = jax.jit(env.reset)(jax.random.key(0), params)
-    result = jax.jit(env.step)(jax.random.key(1), state, env.action_space.sample(jax.random.key(2)), params)
+    observation, state = _jitted(env, "reset")(jax.random.key(0), params)
+    result = _jitted(env, "step")(jax.random.key(1), state, env.action_space.sample(jax.random.key(2)), params)
     for seen in (observation, result[0], result[5]["final_observation"]):
         chex.assert_shape(seen, env.observation_shape)
         chex.assert_type(seen, jnp.float32)
@@ -63,9 +73,10 @@ def test_shapes_dtypes_and_spaces(env: envs_jax.Environment) -> None:
     chex.assert_trees_all_equal_shapes_and_dtypes(state, result[1])
     chex.assert_shape(result[2:5], ())
     chex.assert_type(result[2:5], [jnp.float32, bool, bool])
-    chex.assert_shape(env.labels(state, params), (env.num_propositions,))
-    chex.assert_type(env.labels(state, params), bool)
-    per_proposition, shared = env.proposition_view(observation)
+    labels = _jitted(env, "labels")(state, params)
+    chex.assert_shape(labels, (env.num_propositions,))
+    chex.assert_type(labels, bool)
+    per_proposition, shared = _jitted(env, "proposition_view")(observation)
     assert per_proposition.shape[0] == env.num_propositions
     assert shared.ndim == 1
 
@@ -82,8 +93,8 @@ def test_spaces_contain_what_they_sample_and_nothing_else(env: envs_jax.Environm
 
 def test_truncation_is_not_termination(env: envs_jax.Environment) -> None:
     params = env.default_params.replace(horizon=jnp.int32(5))
-    _, state = jax.jit(env.reset)(jax.random.key(0), params)
-    step_env = jax.jit(env.step_env)
+    _, state = _jitted(env, "reset")(jax.random.key(0), params)
+    step_env = _jitted(env, "step_env")
     for t in range(1, 6):
         action = env.action_space.sample(jax.random.key(t))
         _, state, reward, terminated, truncated, _ = step_env(jax.random.key(t), state, action, params)
@@ -94,7 +105,7 @@ def test_truncation_is_not_termination(env: envs_jax.Environment) -> None:
 
 def test_auto_reset_keeps_the_final_observation_and_never_repeats_a_layout(env: envs_jax.Environment) -> None:
     params = env.default_params.replace(horizon=jnp.int32(4))
-    step_env, reset_to = jax.jit(env.step_env), jax.jit(env.reset_to)
+    step_env, reset_to = _jitted(env, "step_env"), _jitted(env, "reset_to")
     states, (observations, after, _, terminated, truncated, info) = _rollout(env, params, 14)
     assert not terminated.any()
     assert np.array_equal(truncated, np.arange(1, 15)[:, None] % 4 + np.zeros(NUM) == 0)
@@ -114,16 +125,16 @@ def test_auto_reset_keeps_the_final_observation_and_never_repeats_a_layout(env: 
 
 def test_reset_to_a_given_layout(env: envs_jax.Environment) -> None:
     params = env.default_params
-    layout = jax.jit(env.sample_layout)(jax.random.key(3), params)
-    observation, state = env.reset_to(layout, jax.random.key(4), params)
+    layout = _jitted(env, "sample_layout")(jax.random.key(3), params)
+    observation, state = _jitted(env, "reset_to")(layout, jax.random.key(4), params)
     assert _same(state.layout, layout)
-    assert np.array_equal(observation, env.observation(state, params))
+    assert np.array_equal(observation, _jitted(env, "observation")(state, params))
 
 
 def test_a_batch_equals_its_items(env: envs_jax.Environment) -> None:
     params = env.default_params
     keys = jax.random.split(jax.random.key(5), NUM)
-    reset = jax.jit(env.reset)
+    reset = _jitted(env, "reset")
     batch = jax.jit(jax.vmap(env.reset, (0, None)))(keys, params)
     for e in range(NUM):
         assert _same(jax.tree.map(lambda x, e=e: x[e], batch), reset(keys[e], params))
@@ -143,8 +154,8 @@ def test_nothing_recompiles(env: envs_jax.Environment) -> None:
 
 def test_a_resampled_layout_differs_only_where_needed(env: envs_jax.Environment) -> None:
     params = env.default_params
-    layout = jax.jit(env.sample_layout)(jax.random.key(6), params)
-    resample = jax.jit(env.resample_layout)
+    layout = _jitted(env, "sample_layout")(jax.random.key(6), params)
+    resample = _jitted(env, "resample_layout")
     for seed in range(5):
         assert _same(resample(jax.random.key(seed), layout, jnp.bool_(False), params), layout)
         assert not _same(resample(jax.random.key(seed), layout, jnp.bool_(True), params), layout)
