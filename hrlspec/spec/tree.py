@@ -51,7 +51,10 @@ class TaskTree:
 
 
 def subtask_avoid(tree: TaskTree) -> jax.Array:
-    """What each sub-task must avoid, bool ``[N, P]`` (eq. 2): its own avoid and what its siblings reach, minus its reach."""
+    """What each sub-task must avoid, bool ``[N, P]`` (eq. 2): its own avoid and what its siblings reach minus its reach.
+
+    For siblings that reach conjunctions this forbids more than eq. (2) does: ¬(b∧c) becomes ¬b and ¬c.
+    """
     edge = tree.valid & (tree.parent >= 0)
     siblings = (tree.parent[:, None] == tree.parent[None, :]) & edge[:, None] & edge[None, :]
     siblings &= ~jnp.eye(tree.num_nodes, dtype=bool)
