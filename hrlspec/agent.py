@@ -1,0 +1,176 @@
+"""The agent: its networks and the pure functions that act with them.
+
+Axes: **E** environments, **N** tree nodes, **P** atomic propositions, **F** features, **A** actions, **M** tasks.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from envs_jax import Environment
+from hrlspec.config import Config
+from hrlspec.networks.controller import Controller
+from hrlspec.networks.planner import Planner
+from hrlspec.networks.reach_critic import ReachCritic
+from hrlspec.spec import TaskState, TaskTree, initial, subtask_avoid
+
+View = tuple[jax.Array, jax.Array]
+Params = dict[str, Any]
+
+
+@struct.dataclass
+class TaskBook:
+    """M tasks, and what the low level needs of them, computed once per task and parameters.
+
+    Attributes:
+        tree: the tasks, leading axis M.
+        avoid: bool ``[M, N, P]``, p₋ of the sub-task of each edge (eq. 2).
+        future: float32 ``[M, N, F]``, embedding of what remains once each node is reached.
+    """
+
+    tree: TaskTree
+    avoid: jax.Array  # bool [M, N, P]
+    future: jax.Array  # float32 [M, N, F]
+
+
+@dataclasses.dataclass(frozen=True)
+class Agent:
+    """Networks for one environment and one configuration. Static: close over it, or pass it as a static argument.
+
+    Attributes:
+        env: the environment the agent acts in.
+        config: the run's configuration.
+    """
+
+    env: Environment
+    config: Config
+
+    @functools.cached_property
+    def planner(self) -> Planner:
+        """The high level."""
+        return Planner(self.config.network)
+
+    @functools.cached_property
+    def controller(self) -> Controller:
+        """The low level."""
+        return Controller(self.config.network, self.env.action_space.n, self.env.num_propositions)
+
+    @functools.cached_property
+    def reach_critic(self) -> ReachCritic:
+        """The critic behind the shield."""
+        return ReachCritic(self.config.network.reach_critic, self.env.action_space.n)
+
+    def init(self, key: jax.Array) -> Params:
+        """Fresh parameters of the three networks: ``planner``, ``controller``, ``reach_critic``. The key is consumed."""
+        keys = jax.random.split(key, 3)
+        view = self.env.proposition_view(jnp.zeros(self.env.observation_shape))
+        tree = _blank_tree(self.env.num_propositions)
+        no_advice = jnp.zeros(tree.num_nodes)
+        return {
+            "planner": self.planner.init(keys[0], view, tree, initial(tree), no_advice),
+            "controller": self.controller.init(keys[1], view, tree, method="everything"),
+            "reach_critic": self.reach_critic.init(keys[2], view),
+        }
+
+    def embed_task(self, params: Params, tree: TaskTree) -> jax.Array:
+        """Embedding of what remains after each node of one task, float32 ``[N, F]``; zeros for Myopic-low."""
+        if not self.config.future_embedding:
+            return jnp.zeros((tree.num_nodes, self.config.network.task_features))
+        return self.controller.apply(params["controller"], tree, method="embed")
+
+    def open_book(self, params: Params, trees: TaskTree) -> TaskBook:
+        """Prepares tasks (leading axis M) for acting."""
+        return TaskBook(
+            tree=trees,
+            avoid=jax.vmap(subtask_avoid)(trees),
+            future=jax.vmap(self.embed_task, in_axes=(None, 0))(params, trees),
+        )
+
+    def plan(
+        self, params: Params, view: View, tree: TaskTree, state: TaskState, avoid: jax.Array, future: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """The planner on one environment: logits over edges ``[N]`` and the value of the remaining task ``[]``."""
+        advice = jnp.zeros(tree.num_nodes)
+        if self.config.network.advice:
+            values = jax.vmap(lambda r, a, f: self.control(params, view, r, a, f)[1])(tree.reach, avoid, future)
+            advice = jax.lax.stop_gradient(values)
+        return self.planner.apply(params["planner"], view, tree, state, advice)
+
+    def control(
+        self, params: Params, view: View, reach: jax.Array, avoid: jax.Array, future: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """The low level on one environment: action logits ``[A]`` and value ``[]``."""
+        return self.controller.apply(params["controller"], view, reach, avoid, future)
+
+    def reach_values(self, params: Params, view: View) -> jax.Array:
+        """Q(s, g, a) of reaching each proposition, float32 ``[P, A]``."""
+        return self.reach_critic.apply(params["reach_critic"], view)
+
+
+def sample(logits: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Gumbel-max sample from unbatched logits ``[A]`` and its log-probability; zero noise gives the mode."""
+    choice = jnp.argmax(logits + noise).astype(jnp.int32)
+    return choice, jax.nn.log_softmax(logits)[choice]
+
+
+def shielded_action(agent: Agent, params: Params, view: View, avoid: jax.Array, action: jax.Array) -> jax.Array:
+    """Replaces an action that would step on a forbidden proposition (paper, "Avoiding Propositions").
+
+    With k = argmax over p₋ of V(s, g_k): if V(s, g_k) > ν, the action becomes argmin_a Q(s, g_k, a). In mode
+    ``action`` this happens only where the chosen action itself has some Q(s, g, action) > ν.
+    """
+    shield = agent.config.shield
+    if shield.mode == "off":
+        return action
+    values = jnp.where(avoid[:, None], agent.reach_values(params, view), 0.0)
+    danger = values.max(-1) if shield.mode == "state" else values[:, action]
+    nearest = jnp.argmax(danger)
+    away = values[nearest] if shield.mode == "state" else values.max(0)
+    return jnp.where(danger[nearest] > shield.threshold, jnp.argmin(away), action).astype(jnp.int32)
+
+
+def in_groups(
+    function: Callable[[Any], Any], needed: jax.Array, inputs: Any, outputs: Any, group: int
+) -> Any:
+    """Applies a costly function only to the environments that need it.
+
+    A vmapped ``cond`` would compute it for all of them at every step. Instead the waiting ones are gathered
+    in groups of fixed size, computed, and scattered back, until none waits.
+
+    Args:
+        function: maps gathered inputs (leading axis ``group``) to outputs of the same leading axis.
+        needed: bool ``[E]``.
+        inputs: pytree, leading axis E.
+        outputs: pytree, leading axis E: what the others keep.
+        group: how many at a time.
+    """
+    num_envs = needed.shape[0]
+    group = min(group, num_envs)
+
+    def body(carry: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
+        waiting, outputs = carry
+        index = jnp.nonzero(waiting, size=group, fill_value=num_envs)[0]
+        results = function(jax.tree.map(lambda x: x[jnp.minimum(index, num_envs - 1)], inputs))
+        outputs = jax.tree.map(lambda out, new: out.at[index].set(new, mode="drop"), outputs, results)
+        return waiting.at[index].set(False, mode="drop"), outputs
+
+    return jax.lax.while_loop(lambda carry: carry[0].any(), body, (needed, outputs))[1]
+
+
+def _blank_tree(num_propositions: int) -> TaskTree:
+    """Two nodes and no edge, to initialise the networks with; no parameter's shape depends on N."""
+    return TaskTree(
+        parent=jnp.full(2, TaskTree.NO_NODE, jnp.int32),
+        reach=jnp.zeros((2, num_propositions), bool),
+        avoid=jnp.zeros((2, num_propositions), bool),
+        accepting=jnp.zeros(2, bool),
+        valid=jnp.array([True, False]),
+        depth=jnp.zeros(2, jnp.int32),
+    )

@@ -1,0 +1,303 @@
+"""From trajectories to training batches: original and relabelled experience under one roof.
+
+A relabelled copy of an environment's rollout is treated as one more environment, so that both levels train on
+originals and copies with the same code.
+
+Axes: **V** environments and relabelled copies, **T** time steps, **S** episodes (slots), **N** tree nodes,
+**P** atomic propositions, **B** decisions.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from hrlspec.agent import Agent, Params, TaskBook, View, in_groups
+from hrlspec.config import Config
+from hrlspec.relabel import Record, Relabelled, relabel
+from hrlspec.rewards import RewardMachine
+from hrlspec.rollout import Trajectory
+from hrlspec.spec import TaskState, TaskTree, initial
+from hrlspec.targets import low_level_targets, planner_targets
+
+
+@struct.dataclass
+class LowBatch:
+    """Low-level samples; leading axes ``[V, T]``, but for ``tree``, which is ``[V, S, ...]``."""
+
+    tree: TaskTree
+    view: View
+    slot: jax.Array  # int32, which of the trees
+    edge: jax.Array  # int32, the assigned edge
+    action: jax.Array  # int32
+    log_prob: jax.Array  # float32, at the start of the update, under this task
+    advantage: jax.Array  # float32
+    target: jax.Array  # float32
+    on_policy: jax.Array  # bool, counts in the policy loss
+    valid: jax.Array  # bool, counts at all
+
+
+@struct.dataclass
+class PlanBatch:
+    """Planner samples; leading axis B."""
+
+    tree: TaskTree
+    view: View
+    node: jax.Array  # int32
+    blocked: jax.Array  # bool [B, N]
+    edge: jax.Array  # int32, the edge that was assigned
+    log_prob: jax.Array  # float32
+    advantage: jax.Array  # float32
+    target: jax.Array  # float32
+    reached: jax.Array  # bool [B, P], p₊ of the sub-task that was completed
+    next_view: View  # observation when it was
+    completed: jax.Array  # bool, it was, within the episode
+    valid: jax.Array  # bool
+
+
+def build(
+    key: jax.Array,
+    agent: Agent,
+    params: Params,
+    machine: RewardMachine,
+    book: TaskBook,
+    trajectory: Trajectory,
+    reserved: jax.Array,
+) -> tuple[LowBatch, PlanBatch]:
+    """Relabels, computes the targets of both levels, and picks the planner's samples. The key is consumed."""
+    config = agent.config
+    num_slots = max(2, config.num_steps // 5)
+    relabel_key, pick_key = jax.random.split(key)
+    by_env = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), trajectory)
+    num_copies = round(config.relabel.share * config.num_envs)
+    parts = [_originals(config, book, by_env, num_slots)]
+    if num_copies:
+        offset = jax.random.randint(relabel_key, (), 0, config.num_envs)
+        chosen = (offset + jnp.arange(num_copies)) % config.num_envs
+        keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(relabel_key, chosen)
+        some = jax.tree.map(lambda x: x[chosen], by_env)
+        parts.append(_copies(keys, agent, params, machine, book, some, reserved, num_slots))
+    merged = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+    return _with_targets(pick_key, config, merged)
+
+
+@struct.dataclass
+class _Experience:
+    """Experience before targets; leading axes ``[V, T]``, ``tree`` ``[V, S, ...]``."""
+
+    tree: TaskTree
+    view: View
+    slot: jax.Array
+    node: jax.Array
+    blocked: jax.Array
+    edge: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    value: jax.Array
+    decided: jax.Array
+    plan_log_prob: jax.Array
+    plan_value: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    bootstrap: jax.Array
+    plan_bootstrap: jax.Array
+    edge_taken: jax.Array
+    reached: jax.Array
+    on_policy: jax.Array
+    valid: jax.Array
+
+
+def _originals(config: Config, book: TaskBook, rollout: Trajectory, num_slots: int) -> _Experience:
+    """The rollout as it was, ``[E, T]``; episodes beyond the last slot are marked invalid."""
+    envs = jnp.arange(rollout.episode.shape[0])[:, None]
+    tasks = jnp.zeros((envs.shape[0], num_slots), jnp.int32)
+    tasks = tasks.at[envs, rollout.episode].set(rollout.task, mode="drop")
+    valid = rollout.episode < num_slots
+    return _Experience(
+        tree=jax.tree.map(lambda x: x[tasks], book.tree),
+        view=rollout.view,
+        slot=jnp.minimum(rollout.episode, num_slots - 1),
+        node=rollout.node,
+        blocked=rollout.blocked,
+        edge=rollout.assigned,
+        action=rollout.action,
+        log_prob=rollout.log_prob,
+        value=rollout.value,
+        decided=rollout.decided,
+        plan_log_prob=rollout.plan_log_prob,
+        plan_value=rollout.plan_value,
+        reward=rollout.reward / config.value_scale,
+        terminated=rollout.terminated,
+        truncated=rollout.truncated,
+        bootstrap=rollout.bootstrap,
+        plan_bootstrap=rollout.plan_bootstrap,
+        edge_taken=rollout.edge_taken,
+        reached=book.tree.reach[rollout.task, rollout.edge],
+        on_policy=valid & ~rollout.shielded,
+        valid=valid,
+    )
+
+
+def _copies(
+    keys: jax.Array,
+    agent: Agent,
+    params: Params,
+    machine: RewardMachine,
+    book: TaskBook,
+    rollout: Trajectory,
+    reserved: jax.Array,
+    num_slots: int,
+) -> _Experience:
+    """Relabelled copies of the given environments' rollouts, with both levels' opinion of them under the new tasks."""
+    config = agent.config
+    num_nodes = config.curriculum.max_nodes
+    record = Record(
+        slot=rollout.episode,
+        labels=rollout.labels,
+        edge_taken=rollout.edge_taken,
+        reach=book.tree.reach[rollout.task, rollout.edge],
+        avoid=book.tree.avoid[rollout.task, rollout.edge],
+    )
+
+    def one(key: jax.Array, record: Record) -> Relabelled:
+        return relabel(
+            key,
+            record,
+            machine,
+            reserved,
+            num_slots=num_slots,
+            max_path=config.curriculum.levels,
+            max_nodes=num_nodes,
+            max_avoid=config.curriculum.max_avoid,
+            branch=config.relabel.branch,
+        )
+
+    new = jax.vmap(one)(keys, record)
+    copies, num_steps = rollout.episode.shape
+    slot = jnp.minimum(rollout.episode, num_slots - 1)
+    flat = jax.tree.map(lambda x: x.reshape((copies * num_slots, *x.shape[2:])), new.tree)
+    fresh = agent.open_book(params, flat)
+    row = (jnp.arange(copies)[:, None] * num_slots + slot).reshape(-1)
+    edge = new.assigned.reshape(-1)
+    view = jax.tree.map(lambda x: x.reshape((copies * num_steps, *x.shape[2:])), rollout.view)
+    conditions = fresh.tree.reach[row, edge], fresh.avoid[row, edge], fresh.future[row, edge]
+    logits, value = jax.vmap(agent.control, in_axes=(None, 0, 0, 0, 0))(params, view, *conditions)
+    log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), rollout.action.reshape(-1, 1), 1)[:, 0]
+
+    def plan(inputs: tuple[View, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        view, row, node, edge = inputs
+        tree, avoid, future = jax.tree.map(lambda x: x[row], (fresh.tree, fresh.avoid, fresh.future))
+        state = jax.vmap(initial)(tree).replace(node=node)
+        logits, value = jax.vmap(agent.plan, in_axes=(None, 0, 0, 0, 0, 0))(params, view, tree, state, avoid, future)
+        return jnp.take_along_axis(jax.nn.log_softmax(logits), edge[:, None], 1)[:, 0], value
+
+    decided = new.decided.reshape(-1)
+    nothing = jnp.zeros(decided.shape)
+    inputs = (view, row, new.node.reshape(-1), edge)
+    plan_log_prob, plan_value = in_groups(plan, decided, inputs, (nothing, nothing), group=128)
+
+    def shaped(x: jax.Array) -> jax.Array:
+        return x.reshape((copies, num_steps, *x.shape[1:]))
+
+    return _Experience(
+        tree=new.tree,
+        view=rollout.view,
+        slot=slot,
+        node=new.node,
+        blocked=jnp.zeros((copies, num_steps, num_nodes), bool),
+        edge=new.assigned,
+        action=rollout.action,
+        log_prob=shaped(log_prob),
+        value=shaped(value),
+        decided=new.decided,
+        plan_log_prob=shaped(plan_log_prob),
+        plan_value=shaped(plan_value),
+        reward=new.reward / config.value_scale,
+        terminated=new.terminated | ~new.valid,
+        truncated=jnp.zeros_like(new.valid),
+        bootstrap=jnp.zeros_like(new.reward),
+        plan_bootstrap=jnp.zeros_like(new.reward),
+        edge_taken=rollout.edge_taken & new.valid,
+        reached=record.reach,
+        on_policy=new.valid & ~rollout.shielded,
+        valid=new.valid,
+    )
+
+
+def _with_targets(key: jax.Array, config: Config, x: _Experience) -> tuple[LowBatch, PlanBatch]:
+    """Targets of both levels, and the planner's share of the decisions."""
+
+    def in_time(*arrays: jax.Array) -> tuple[jax.Array, ...]:
+        return tuple(jnp.swapaxes(a, 0, 1) for a in arrays)
+
+    ends = in_time(x.reward, x.terminated, x.truncated)
+    target = low_level_targets(
+        *ends,
+        *in_time(x.value, x.bootstrap, x.decided, x.plan_value),
+        discount=config.discount,
+        gae_lambda=config.low.gae_lambda,
+        max_operator=config.max_operator,
+    ).T
+    plan_advantage, plan_target = planner_targets(
+        *ends,
+        *in_time(x.decided, x.plan_value, x.plan_bootstrap),
+        discount=config.discount,
+        gae_lambda=config.high.gae_lambda,
+    )
+    low = LowBatch(
+        tree=x.tree,
+        view=x.view,
+        slot=x.slot,
+        edge=x.edge,
+        action=x.action,
+        log_prob=x.log_prob,
+        advantage=target - x.value,
+        target=target,
+        on_policy=x.on_policy,
+        valid=x.valid,
+    )
+    return low, _pick_decisions(key, config, x, plan_advantage.T, plan_target.T)
+
+
+def _pick_decisions(
+    key: jax.Array, config: Config, x: _Experience, advantage: jax.Array, target: jax.Array
+) -> PlanBatch:
+    """A random subset of the decisions, of fixed size B; when there are fewer, the rest is marked invalid."""
+    num_rows, num_steps = x.decided.shape
+    step = jnp.arange(num_steps)
+    # The first completion and the first end of a sub-task at or after each step.
+    ended = x.edge_taken | x.terminated | x.truncated | jnp.roll(x.decided, -1, 1)
+    end = jax.lax.cummin(jnp.where(ended, step, num_steps), axis=1, reverse=True)
+    last = jnp.minimum(end, num_steps - 1)
+    completed = (end < num_steps) & jnp.take_along_axis(x.edge_taken, last, 1)
+    wanted = x.decided & x.valid & (completed | config.unfinished)
+    lottery = jnp.where(wanted, jax.random.uniform(key, wanted.shape), -1.0).reshape(-1)
+    size = min(config.steps_per_iteration // config.planner_share, num_rows * num_steps)
+    score, index = jax.lax.top_k(lottery, size)
+    row, time = index // num_steps, index % num_steps
+    end = last[row, time]
+    after = jnp.minimum(end + 1, num_steps - 1)
+    goes_on = completed[row, time] & (end + 1 < num_steps) & ~(x.terminated | x.truncated)[row, end]
+    slot = x.slot[row, time]
+    return PlanBatch(
+        tree=jax.tree.map(lambda a: a[row, slot], x.tree),
+        view=jax.tree.map(lambda a: a[row, time], x.view),
+        node=x.node[row, time],
+        blocked=x.blocked[row, time],
+        edge=x.edge[row, time],
+        log_prob=x.plan_log_prob[row, time],
+        advantage=advantage[row, time],
+        target=target[row, time],
+        reached=x.reached[row, end],
+        next_view=jax.tree.map(lambda a: a[row, after], x.view),
+        completed=goes_on,
+        valid=score >= 0,
+    )
+
+
+def plan_state(batch: PlanBatch) -> TaskState:
+    """The task states of planner samples (leading axis B)."""
+    state = jax.vmap(initial)(batch.tree)
+    return state.replace(node=batch.node, blocked=batch.blocked)

@@ -1,0 +1,152 @@
+"""Everything a run can be told, as frozen dataclasses; the tuned values live in ``experiments/presets.py``.
+
+All fields are static: they shape the compiled program. What may change inside a run (parameters, counters,
+curriculum level) lives in :class:`hrlspec.training.TrainState`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes of the networks (paper, "High-level Architecture" and "Low-level Architecture")."""
+
+    latent: int = 64
+    """Width of both encoders' output."""
+    conv_channels: tuple[int, ...] = (16, 32, 64)
+    """Channels of the 2x2 convolutions for image observations; none: images are encoded as vectors."""
+    encoder_mlp: tuple[int, ...] = (128, 128)
+    """Hidden units of the encoder for vectors."""
+    planner_features: int = 64
+    """F, node features of the planner's GNN."""
+    planner_hidden: int = 128
+    """Hidden units of the planner's transition model, policy and critic."""
+    planner_rounds: int = 8
+    """Rounds of message passing of the planner; look-ahead ends at this depth. 0: one sweep from the leaves to the root,
+    which looks ahead without limit and costs an eighth."""
+    task_features: int = 32
+    """Node features of the low level's GNN over the remaining tasks."""
+    task_rounds: int = 8
+    """Rounds of message passing of the low level's GNN; 0 as for ``planner_rounds``."""
+    actor: tuple[int, ...] = (64, 64, 64)
+    critic: tuple[int, ...] = (64, 64)
+    reach_critic: tuple[int, ...] = (64, 64)
+    """Hidden units of the critic behind the shield."""
+    spotlights: int = 0
+    """Task-conditioned encoding: the low level sees the observation through p₊, p₋ and this many mixtures of propositions
+    computed from the embedding of the remaining task. 0 encodes the observation without the task, as in the paper."""
+    child_embeddings: bool = False
+    """Whether the planner's logit of an edge also sees the embedding of the node it leads to."""
+    advice: bool = False
+    """Whether the planner also sees the low level's value of each candidate sub-task (gradient stopped)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PPOConfig:
+    """Proximal policy optimisation at one level."""
+
+    learning_rate: float = 1e-3
+    final_learning_rate: float = 0.0
+    epochs: int = 3
+    minibatches: int = 8
+    clip: float = 0.2
+    entropy: float = 0.002
+    final_entropy: float = 0.002
+    value_coefficient: float = 0.5
+    gae_lambda: float = 0.95
+    max_grad_norm: float = 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class CurriculumConfig:
+    """Tasks to collect on (paper, "Training Curriculum")."""
+
+    levels: int = 4
+    """K, the longest sequence."""
+    promotion: float = 0.95
+    """Success rate that promotes to the next level."""
+    window: int = 512
+    """Finished episodes of the current level over which it is measured."""
+    earlier: float = 0.2
+    """Share of episodes on levels already passed."""
+    tree_share: float = 0.0
+    """Share of random trees, instead of sequences, in each level's tasks."""
+    max_branching: int = 3
+    max_avoid: int = 3
+    tasks_per_level: int = 512
+    """Rows of the bank for each level; the bank is drawn anew between chunks."""
+    max_nodes: int = 16
+    """N, the padded size of training tasks."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RelabelConfig:
+    """Experience relabelling into random trees (paper, "Experience Replay")."""
+
+    share: float = 0.5
+    """Share of the environments whose trajectories are trained on a second time, relabelled. 0 switches it off."""
+    branch: float = 0.7
+    """Probability of a random branch at each node of the completed path."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ShieldConfig:
+    """Proposition avoidance (paper, "Avoiding Propositions")."""
+
+    mode: Literal["off", "state", "action"] = "state"
+    """``state`` replaces the action wherever a forbidden proposition is near, as in the paper; ``action`` only where the
+    chosen action itself leads to it."""
+    threshold: float = 0.9
+    """ν: V(s, g) above it counts as near."""
+    discount: float = 0.85
+    """Discount of the reach critic: its value is discount^(steps to g - 1)."""
+    learning_rate: float = 1e-3
+    minibatches: int = 8
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """A whole training run, less its environment."""
+
+    num_envs: int = 128
+    """E, environments stepped side by side."""
+    num_steps: int = 64
+    """T, steps of a rollout."""
+    total_steps: int = 3_000_000
+    discount: float = 0.94
+    """γ, per environment step, at both levels."""
+    max_operator: bool = True
+    """Whether the target at a new sub-task is raised to the planner's value (eq. 6)."""
+    future_embedding: bool = True
+    """Whether the low level sees what remains after its sub-task; off is the ablation Myopic-low."""
+    unfinished: bool = False
+    """Whether sub-tasks that were assigned but not completed train the planner."""
+    transe: float = 0.01
+    """λ, the weight of the TransE loss."""
+    transe_margin: float = 1.0
+    """ξ, the margin of the TransE loss."""
+    value_scale: float = 1.0
+    """Returns are divided by this before the critics see them."""
+    planner_share: int = 16
+    """The planner trains on at most E·T divided by this many decisions per iteration."""
+    group: int = 32
+    """Environments the planner decides for at a time."""
+    low: PPOConfig = PPOConfig()
+    high: PPOConfig = PPOConfig(learning_rate=5e-4, epochs=2, minibatches=2, entropy=0.005, final_entropy=0.005)
+    network: NetworkConfig = NetworkConfig()
+    curriculum: CurriculumConfig = CurriculumConfig()
+    relabel: RelabelConfig = RelabelConfig()
+    shield: ShieldConfig = ShieldConfig()
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """E·T, environment steps of one iteration."""
+        return self.num_envs * self.num_steps
+
+    @property
+    def num_iterations(self) -> int:
+        """Iterations that make up ``total_steps``, rounded up."""
+        return -(-self.total_steps // self.steps_per_iteration)

@@ -1,0 +1,154 @@
+"""Running a trained agent on given tasks in given layouts, one episode each, all side by side.
+
+Axes: **B** episodes, **H** horizon, **N** tree nodes.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from hrlspec.agent import Agent, Params
+from hrlspec.interaction import act, decide, start, transition
+from hrlspec.rewards import RewardMachine
+from hrlspec.spec import TaskTree
+
+
+@struct.dataclass
+class Episodes:
+    """What came of B episodes.
+
+    Attributes:
+        success: bool ``[B]``, the task was satisfied within the horizon.
+        violated: bool ``[B]``, the task was violated, or the environment ended the episode.
+        steps: int32 ``[B]``, environment steps until the episode ended.
+        returns: float32 ``[B]``, undiscounted sum of rewards.
+    """
+
+    success: Any
+    violated: Any
+    steps: Any
+    returns: Any
+
+
+@struct.dataclass
+class Trace:
+    """The way there, leading axes ``[H, B]``; entry t is the state before step t, meaningful while ``running``.
+
+    Attributes:
+        env_state: states of the environment.
+        node: int32, task node.
+        assigned: int32, the edge in force.
+        running: bool.
+    """
+
+    env_state: Any
+    node: Any
+    assigned: Any
+    running: Any
+
+
+def run_episodes(
+    key: jax.Array,
+    agent: Agent,
+    params: Params,
+    machine: RewardMachine,
+    trees: TaskTree,
+    layouts: Any,
+    *,
+    greedy: bool = False,
+    shield: bool = False,
+    chunk: int = 500,
+) -> Episodes:
+    """One episode per task and layout.
+
+    Args:
+        key: consumed.
+        agent: the networks.
+        params: their parameters.
+        machine: the rewards.
+        trees: tasks, leading axis B; any N.
+        layouts: layouts of the environment, leading axis B.
+        greedy: take the most likely action and sub-task instead of sampling.
+        shield: replace actions that would step on forbidden propositions.
+        chunk: episodes run side by side; bounds memory. Each size compiles once.
+
+    Returns:
+        numpy arrays, leading axis B.
+    """
+    total = jax.tree.leaves(trees)[0].shape[0]
+    chunk = min(chunk, total)
+    parts = []
+    for first in range(0, total, chunk):
+        # The last chunk is filled up by wrapping around, so that every chunk has one compiled shape.
+        rows = np.arange(first, first + chunk) % total
+        some = jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], (trees, layouts))
+        episodes, _ = _run(jax.random.fold_in(key, first), agent, params, machine, *some, greedy, shield, False)
+        parts.append(jax.tree.map(lambda x, n=total - first: np.asarray(x)[:n], episodes))
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+def trace_episodes(
+    key: jax.Array,
+    agent: Agent,
+    params: Params,
+    machine: RewardMachine,
+    trees: TaskTree,
+    layouts: Any,
+    *,
+    greedy: bool = False,
+    shield: bool = False,
+) -> tuple[Episodes, Trace]:
+    """As :func:`run_episodes`, for a few episodes, with the states on the way."""
+    return jax.tree.map(np.asarray, _run(key, agent, params, machine, trees, layouts, greedy, shield, True))
+
+
+@functools.partial(jax.jit, static_argnames=("agent", "greedy", "shield", "traced"))
+def _run(
+    key: jax.Array,
+    agent: Agent,
+    params: Params,
+    machine: RewardMachine,
+    trees: TaskTree,
+    layouts: Any,
+    greedy: bool,
+    shield: bool,
+    traced: bool,
+) -> tuple[Episodes, Trace | None]:
+    num_episodes, num_nodes = trees.parent.shape
+    rows = jnp.arange(num_episodes, dtype=jnp.int32)
+    book = agent.open_book(params, trees)
+    worker = start(agent, machine, layouts, rows, jax.vmap(jax.random.fold_in, (None, 0))(key, rows), book)
+    noise_scale = 0.0 if greedy else 1.0
+    zeros = jnp.zeros(num_episodes)
+    outcome = Episodes(success=zeros > 0, violated=zeros > 0, steps=zeros.astype(jnp.int32), returns=zeros)
+
+    def step(carry: tuple[Any, ...]) -> tuple[tuple[Any, ...], Trace]:
+        worker, outcome, running, time = carry
+        step_key, plan_key, act_key = jax.random.split(jax.random.fold_in(key, num_episodes + time), 3)
+        worker = worker.replace(awaiting=worker.awaiting & running)
+        noise = noise_scale * jax.random.gumbel(plan_key, (num_episodes, num_nodes))
+        worker, _ = decide(agent, params, book, worker, noise)
+        noise = noise_scale * jax.random.gumbel(act_key, (num_episodes, agent.env.action_space.n))
+        action, *_ = act(agent, params, book, worker, noise, shield=shield)
+        seen = Trace(worker.env_state, worker.task_state.node, worker.assigned, running)
+        worker, result = transition(agent, machine, book, worker, action, jax.random.split(step_key, num_episodes))
+        outcome = Episodes(
+            success=outcome.success | (running & result.satisfied),
+            violated=outcome.violated | (running & result.terminated & ~result.satisfied),
+            steps=outcome.steps + running,
+            returns=outcome.returns + running * result.reward,
+        )
+        running &= ~(result.terminated | result.truncated)
+        return (worker, outcome, running, time + 1), seen
+
+    carry = (worker, outcome, jnp.ones(num_episodes, bool), jnp.int32(0))
+    if traced:
+        carry, trace = jax.lax.scan(lambda c, _: step(c), carry, length=agent.env.horizon)
+        return carry[1], trace
+    return jax.lax.while_loop(lambda c: c[2].any(), lambda c: step(c)[0], carry)[1], None

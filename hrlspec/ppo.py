@@ -1,0 +1,75 @@
+"""Proximal policy optimisation: losses and one guarded gradient step (Schulman et al., 2017)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from hrlspec.config import PPOConfig
+
+
+def masked_mean(x: jax.Array, mask: jax.Array) -> jax.Array:
+    """Mean of ``x`` where ``mask``; 0 when nothing is."""
+    mask = mask.astype(x.dtype)
+    return (x * mask).sum() / jnp.maximum(mask.sum(), 1.0)
+
+
+def normalise(advantage: jax.Array, mask: jax.Array) -> jax.Array:
+    """Advantages with mean 0 and standard deviation 1 over the masked samples."""
+    mean = masked_mean(advantage, mask)
+    variance = masked_mean((advantage - mean) ** 2, mask)
+    return (advantage - mean) / jnp.sqrt(variance + 1e-8)
+
+
+def policy_loss(log_prob: jax.Array, old: jax.Array, advantage: jax.Array, mask: jax.Array, clip: float) -> jax.Array:
+    """Clipped surrogate; ``old`` is the log-probability at the start of the update, under the same task."""
+    ratio = jnp.exp(jnp.where(mask, log_prob - old, 0.0))
+    surrogate = jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - clip, 1 + clip) * advantage)
+    return -masked_mean(surrogate, mask)
+
+
+def entropy(logits: jax.Array) -> jax.Array:
+    """Entropy of categorical distributions ``[..., A]``, in nats."""
+    log_probs = jax.nn.log_softmax(logits)
+    return -(jnp.exp(log_probs) * jnp.where(log_probs > -1e8, log_probs, 0.0)).sum(-1)
+
+
+def optimiser(max_grad_norm: float) -> optax.GradientTransformation:
+    """Adam behind a global-norm clip, without a learning rate: :func:`gradient_step` applies the annealed one."""
+    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.scale_by_adam(eps=1e-5))
+
+
+def annealed(first: float, last: float, progress: jax.Array) -> jax.Array:
+    """Linear from ``first`` to ``last`` as ``progress`` goes from 0 to 1."""
+    return first + (last - first) * jnp.clip(progress, 0.0, 1.0)
+
+
+def gradient_step(
+    loss: Callable[[Any], tuple[jax.Array, dict[str, jax.Array]]],
+    params: Any,
+    optimiser_state: optax.OptState,
+    transform: optax.GradientTransformation,
+    learning_rate: jax.Array,
+) -> tuple[Any, optax.OptState, dict[str, jax.Array]]:
+    """One step; a non-finite loss or gradient leaves everything as it was and is counted in ``skipped``."""
+    (value, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(params)
+    norm = optax.global_norm(gradient)
+    finite = jnp.isfinite(norm) & jnp.isfinite(value)
+    updates, new_state = transform.update(gradient, optimiser_state, params)
+    stepped = jax.tree.map(lambda p, u: p - learning_rate * u, params, updates)
+    params, optimiser_state = jax.tree.map(
+        lambda new, old: jnp.where(finite, new, old), (stepped, new_state), (params, optimiser_state)
+    )
+    return params, optimiser_state, {**metrics, "grad_norm": norm, "skipped": 1.0 - finite}
+
+
+def annealed_rates(config: PPOConfig, progress: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Learning rate and entropy coefficient at this point of the run."""
+    return (
+        annealed(config.learning_rate, config.final_learning_rate, progress),
+        annealed(config.entropy, config.final_entropy, progress),
+    )

@@ -1,0 +1,229 @@
+"""Experience relabelling: a trajectory becomes the record of another, random task (paper, "Experience Replay").
+
+The sub-tasks an episode completed become the path of a new tree; random branches are added along it so that
+the recorded labels, replayed through the monitor on the new tree, visit exactly that path at the recorded times.
+
+Axes: **T** time steps, **S** episodes (slots) of one environment's rollout, **K** sub-tasks of a path, **N** tree
+nodes, **P** atomic propositions.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from hrlspec import rewards
+from hrlspec.rewards import RewardMachine
+from hrlspec.spec import TaskTree, task_hash
+
+
+@struct.dataclass
+class Record:
+    """What relabelling needs of one environment's rollout.
+
+    Attributes:
+        slot: int32 ``[T]``, which episode of the rollout the step belongs to.
+        labels: bool ``[T, P]``, labels of the state after the step.
+        edge_taken: bool ``[T]``, the step completed a sub-task.
+        reach: bool ``[T, P]``, what the edge taken reaches.
+        avoid: bool ``[T, P]``, its ``ensuring`` part.
+    """
+
+    slot: jax.Array
+    labels: jax.Array
+    edge_taken: jax.Array
+    reach: jax.Array
+    avoid: jax.Array
+
+
+@struct.dataclass
+class Relabelled:
+    """The same rollout as a record of other tasks.
+
+    Attributes:
+        tree: the new tasks, leading axis S.
+        node: int32 ``[T]``, node of the new task before the step.
+        assigned: int32 ``[T]``, the edge pursued: the next one of the path.
+        decided: bool ``[T]``, a decision is due before the step.
+        reward: float32 ``[T]``.
+        terminated: bool ``[T]``, the step satisfied the new task.
+        valid: bool ``[T]``, the step belongs to the new task; later ones do not.
+    """
+
+    tree: TaskTree
+    node: jax.Array
+    assigned: jax.Array
+    decided: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    valid: jax.Array
+
+
+def relabel(
+    key: jax.Array,
+    record: Record,
+    machine: RewardMachine,
+    reserved: jax.Array,
+    *,
+    num_slots: int,
+    max_path: int,
+    max_nodes: int,
+    max_avoid: int,
+    branch: float,
+) -> Relabelled:
+    """Relabels one environment's rollout; ``vmap`` for more.
+
+    An episode without a completed sub-task, one beyond ``num_slots``, and a new task whose hash is
+    reserved for evaluation are marked invalid.
+
+    Args:
+        key: consumed.
+        record: the rollout.
+        machine: the rewards to recompute; bonus rules start anew with each new task.
+        reserved: uint32 ``[M]``, sorted hashes of held-out tasks.
+        num_slots: S.
+        max_path: K, the longest path kept.
+        max_nodes: N of the new trees; branches are shortened to fit.
+        max_avoid: largest random ``ensuring`` part of a branch's edge.
+        branch: probability of a branch at each node of the path.
+    """
+    done_before = _completed_before(record)
+    path = _path(record, done_before, num_slots, max_path)
+    tree = jax.vmap(
+        lambda k, *p: _grow(k, *p, max_nodes=max_nodes, max_avoid=max_avoid, branch=branch),
+    )(jax.random.split(key, num_slots), *path)
+    length = path[0]
+    held_out = jnp.isin(jax.vmap(task_hash)(tree), reserved) if reserved.shape[0] else jnp.zeros(num_slots, bool)
+
+    slot = jnp.minimum(record.slot, num_slots - 1)
+    valid = (record.slot < num_slots) & ~held_out[slot] & (done_before < length[slot])
+    first = jnp.concatenate([jnp.ones(1, bool), record.slot[1:] != record.slot[:-1]])
+    decided = valid & (first | jnp.concatenate([jnp.zeros(1, bool), record.edge_taken[:-1]]))
+    terminated = valid & record.edge_taken & (done_before + 1 == length[slot])
+
+    def pay(rules: jax.Array, step: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+        labels, reached, taken, completed, first = step
+        rules = jnp.where(first, rewards.initial(machine), rules)
+        return rewards.step(machine, rules, labels, reached, taken, completed)
+
+    steps = (record.labels, record.reach, record.edge_taken & valid, terminated, first)
+    reward = jax.lax.scan(pay, rewards.initial(machine), steps)[1]
+    return Relabelled(
+        tree=tree,
+        node=jnp.where(valid, done_before, 0),
+        assigned=jnp.where(valid, done_before + 1, 0),
+        decided=decided,
+        reward=reward * valid,
+        terminated=terminated,
+        valid=valid,
+    )
+
+
+def _completed_before(record: Record) -> jax.Array:
+    """How many sub-tasks its episode had completed before each step, int32 ``[T]``."""
+    total = jnp.cumsum(record.edge_taken) - record.edge_taken
+    first = jnp.concatenate([jnp.ones(1, bool), record.slot[1:] != record.slot[:-1]])
+    return (total - jax.lax.cummax(jnp.where(first, total, 0))).astype(jnp.int32)
+
+
+def _path(
+    record: Record, done_before: jax.Array, num_slots: int, max_path: int
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """The completed path of each slot: length ``[S]``, reach, avoid and the labels seen on the way, ``[S, K, P]``."""
+    num_propositions = record.labels.shape[-1]
+    empty = jnp.zeros((num_slots, max_path, num_propositions), jnp.int32)
+    slot, place = record.slot, done_before
+    seen = empty.at[slot, place].max(record.labels.astype(jnp.int32), mode="drop") > 0
+    taken_place = jnp.where(record.edge_taken, place, max_path)
+    reach = empty.at[slot, taken_place].set(record.reach.astype(jnp.int32), mode="drop") > 0
+    avoid = empty.at[slot, taken_place].set(record.avoid.astype(jnp.int32), mode="drop") > 0
+    length = jnp.zeros(num_slots, jnp.int32).at[slot].add(record.edge_taken.astype(jnp.int32), mode="drop")
+    return jnp.minimum(length, max_path), reach, avoid, seen
+
+
+def branch_lengths(max_path: int, max_nodes: int) -> np.ndarray:
+    """Longest branch at each node of the path, int ``[K]``: K - i, shortened alike until everything fits N nodes.
+
+    Raises:
+        ValueError: if not even the path fits.
+    """
+    room = max_nodes - 1 - max_path
+    if room < 0:
+        raise ValueError(f"a path of {max_path} sub-tasks needs {max_path + 1} nodes, max_nodes is {max_nodes}")
+    full = max_path - np.arange(max_path)
+    cap = max((c for c in range(max_path + 1) if np.minimum(full, c).sum() <= room), default=0)
+    return np.minimum(full, cap)
+
+
+def _grow(
+    key: jax.Array,
+    length: jax.Array,
+    path_reach: jax.Array,
+    path_avoid: jax.Array,
+    seen: jax.Array,
+    *,
+    max_nodes: int,
+    max_avoid: int,
+    branch: float,
+) -> TaskTree:
+    """One tree around a completed path.
+
+    Nodes 0..K are the path; then, for each node of the path, a fixed run of places for its branch. The first
+    goal of the branch at node i is none of the labels seen while sub-task i was under way.
+    """
+    max_path, num_propositions = path_reach.shape
+    longest = branch_lengths(max_path, max_nodes)
+    keys = jax.random.split(key, 4)
+    place = np.arange(max_path)
+    grows = jax.random.bernoulli(keys[0], branch, (max_path,)) & (place < length)
+    limit = jnp.minimum(length - place, longest)
+    wanted = jnp.where(grows, 1 + jnp.floor(jax.random.uniform(keys[1], (max_path,)) * limit).astype(jnp.int32), 0)
+    wanted = jnp.minimum(wanted, limit)
+    lottery = jax.random.uniform(keys[2], (max_nodes, num_propositions))
+    avoid_noise = jax.random.uniform(keys[3], (max_nodes, num_propositions + 1))
+
+    parent = np.full(max_nodes, TaskTree.NO_NODE, np.int32)
+    depth = np.zeros(max_nodes, np.int32)
+    parent[1 : max_path + 1], depth[1 : max_path + 1] = place, place + 1
+    reach = [jnp.zeros(num_propositions, bool), *path_reach]
+    avoid = [jnp.zeros(num_propositions, bool), *path_avoid]
+    valid = [jnp.bool_(True), *(place < length)]
+    accepting = [jnp.bool_(False), *(place + 1 == length)]
+    for i in range(max_path):
+        before = path_reach[i - 1] if i else jnp.zeros(num_propositions, bool)
+        previous, exists = i, wanted[i] > 0
+        excluded = seen[i] | before | path_reach[i]
+        for j in range(longest[i]):
+            node = len(reach)
+            exists = exists & (j < wanted[i]) & ~excluded.all()
+            goal = jax.nn.one_hot(jnp.argmax(jnp.where(excluded, -1.0, lottery[node])), num_propositions) > 0
+            parent[node], depth[node] = previous, depth[previous] + 1
+            reach.append(goal & exists)
+            avoid.append(_random_avoid(avoid_noise[node], goal | before, max_avoid) & exists)
+            valid.append(exists)
+            accepting.append(exists)
+            if j:
+                accepting[previous] = accepting[previous] & ~exists
+            previous, before, excluded = node, goal, goal
+    padding = max_nodes - len(reach)
+    valid_nodes = jnp.pad(jnp.stack(valid), (0, padding))
+    return TaskTree(
+        parent=jnp.where(valid_nodes, parent, TaskTree.NO_NODE),
+        reach=jnp.pad(jnp.stack(reach), ((0, padding), (0, 0))) & valid_nodes[:, None],
+        avoid=jnp.pad(jnp.stack(avoid), ((0, padding), (0, 0))) & valid_nodes[:, None],
+        accepting=jnp.pad(jnp.stack(accepting), (0, padding)) & valid_nodes,
+        valid=valid_nodes,
+        depth=jnp.where(valid_nodes, depth, 0),
+    )
+
+
+def _random_avoid(noise: jax.Array, forbidden: jax.Array, max_avoid: int) -> jax.Array:
+    """A random set of at most ``max_avoid`` (and P - 2) propositions outside ``forbidden``, its size uniform; bool ``[P]``."""
+    num_propositions = forbidden.shape[0]
+    most = max(0, min(max_avoid, num_propositions - 2))
+    size = jnp.floor(noise[-1] * (most + 1)).astype(jnp.int32)
+    score = jnp.where(forbidden, -1.0, noise[:-1])
+    rank = (score[None, :] > score[:, None]).sum(-1)
+    return (rank < size) & ~forbidden

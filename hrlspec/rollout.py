@@ -1,0 +1,158 @@
+"""Collecting experience: E environments, T steps, one scan.
+
+Axes: **T** time steps, **E** environments, **S** layouts of an environment's pool, **M** tasks, **N** tree nodes,
+**P** atomic propositions.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from hrlspec import curriculum
+from hrlspec.agent import Agent, Params, TaskBook, View
+from hrlspec.interaction import Decision, Worker, act, plan_where, restart_where, transition
+from hrlspec.rewards import RewardMachine
+
+
+@struct.dataclass
+class Trajectory:
+    """What was collected; every field has leading axes ``[T, E]``. "Before" and "after" are relative to the step."""
+
+    view: View  # observation before
+    task: jax.Array  # int32, row of the task book
+    episode: jax.Array  # int32, which episode of this rollout, 0-based
+    node: jax.Array  # int32, task node before
+    blocked: jax.Array  # bool [..., N], blocked edges before
+    assigned: jax.Array  # int32, edge pursued
+    decided: jax.Array  # bool, the planner decided before
+    plan_log_prob: jax.Array  # float32, where decided
+    plan_value: jax.Array  # float32, where decided
+    action: jax.Array  # int32
+    log_prob: jax.Array  # float32
+    value: jax.Array  # float32
+    shielded: jax.Array  # bool, the shield replaced the action
+    labels: jax.Array  # bool [..., P], after
+    edge: jax.Array  # int32, node whose edge was taken, or the node before when none was
+    edge_taken: jax.Array  # bool
+    reward: jax.Array  # float32
+    terminated: jax.Array  # bool
+    truncated: jax.Array  # bool
+    bootstrap: jax.Array  # float32, low level's value after; where truncated and at T - 1
+    plan_bootstrap: jax.Array  # float32, planner's value after; likewise
+    satisfied: jax.Array  # bool
+    level: jax.Array  # int32, curriculum level of the task
+
+
+@struct.dataclass
+class Collector:
+    """What goes on from one rollout to the next; leading axis E."""
+
+    worker: Worker
+    decision: Decision  # made for the state that the worker is in
+    level: jax.Array  # int32 [E], curriculum level of each task
+    started: jax.Array  # int32 [E], episodes started so far, for the pool
+
+
+def collect(
+    key: jax.Array,
+    agent: Agent,
+    params: Params,
+    machine: RewardMachine,
+    book: TaskBook,
+    collector: Collector,
+    pool: Any,
+    level: jax.Array,
+) -> tuple[Collector, Trajectory]:
+    """Rolls out E×T steps. Workers come and go with a sub-task assigned: decisions are made at the end of a step.
+
+    Args:
+        key: consumed; every environment's randomness derives from its index.
+        agent: the networks.
+        params: their parameters.
+        machine: the rewards.
+        book: tasks: the E running ones, then the bank, level by level.
+        collector: where the last rollout stopped.
+        pool: fresh layouts ``[E, S, ...]``; environment e takes them in turn.
+        level: int32 ``[]``, the curriculum level.
+    """
+    config = agent.config
+    num_envs, num_nodes = config.num_envs, book.tree.parent.shape[-1]
+    pool_size = jax.tree.leaves(pool)[0].shape[1]
+    envs = jnp.arange(num_envs)
+
+    def randomness(env: jax.Array) -> tuple[jax.Array, ...]:
+        keys = jax.random.split(jax.random.fold_in(key, env), 5)
+        shape = (config.num_steps,)
+        levels = curriculum.draw_levels(keys[2], level, config.curriculum.earlier, config.num_steps)
+        rows = jax.random.randint(keys[3], shape, 0, config.curriculum.tasks_per_level)
+        return (
+            jax.random.gumbel(keys[0], (config.num_steps, num_nodes)),
+            jax.random.gumbel(keys[1], (config.num_steps, agent.env.action_space.n)),
+            levels,
+            num_envs + levels * config.curriculum.tasks_per_level + rows,
+            jax.random.split(keys[4], config.num_steps),
+        )
+
+    def step(collector: Collector, inputs: tuple[jax.Array, ...]) -> tuple[Collector, Trajectory]:
+        plan_noise, noise, next_level, next_task, keys = inputs
+        before, decision = collector.worker, collector.decision
+        action, log_prob, value, shielded = act(agent, params, book, before, noise, shield=config.shield.mode != "off")
+        step_keys, reset_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
+        worker, outcome = transition(agent, machine, book, before, action, step_keys)
+        ended = outcome.terminated | outcome.truncated
+        started = collector.started + ended
+        layouts = jax.tree.map(lambda x: x[envs, started % pool_size], pool)
+        after = restart_where(agent, machine, worker, ended, layouts, next_task, reset_keys, book)
+        # One pass of the planner serves the decisions that are due and the values of truncated states.
+        both = jax.tree.map(lambda *x: jnp.concatenate(x), after, worker)
+        needed = jnp.concatenate([after.awaiting, outcome.truncated])
+        plan_noise = jnp.concatenate([plan_noise, jnp.zeros_like(plan_noise)])
+        choice, plan_log_prob, plan_value = plan_where(agent, params, book, both, needed, plan_noise)
+        record = Trajectory(
+            view=before.view,
+            task=before.task,
+            episode=collector.started,
+            node=before.task_state.node,
+            blocked=before.task_state.blocked,
+            assigned=before.assigned,
+            decided=decision.made,
+            plan_log_prob=decision.log_prob,
+            plan_value=decision.value,
+            action=action,
+            log_prob=log_prob,
+            value=value,
+            shielded=shielded,
+            labels=outcome.labels,
+            edge=worker.task_state.node,
+            edge_taken=outcome.edge_taken,
+            reward=outcome.reward,
+            terminated=outcome.terminated,
+            truncated=outcome.truncated,
+            bootstrap=plan_value[num_envs:],
+            plan_bootstrap=plan_value[num_envs:],
+            satisfied=outcome.satisfied,
+            level=collector.level,
+        )
+        collector = Collector(
+            worker=after.replace(assigned=choice[:num_envs], awaiting=jnp.zeros(num_envs, bool)),
+            decision=Decision(after.awaiting, plan_log_prob[:num_envs], plan_value[:num_envs]),
+            level=jnp.where(ended, next_level, collector.level),
+            started=started,
+        )
+        return collector, record
+
+    inputs = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), jax.vmap(randomness)(envs))
+    collector = collector.replace(started=jnp.zeros(num_envs, jnp.int32))
+    collector, trajectory = jax.lax.scan(step, collector, inputs)
+    low = act(agent, params, book, collector.worker, jnp.zeros((num_envs, agent.env.action_space.n)), shield=False)[2]
+    # In the middle of a sub-task the low level's value is the one of going on with it.
+    high = jnp.where(collector.decision.made, collector.decision.value, low)
+    cut = trajectory.truncated[-1]
+    return collector, trajectory.replace(
+        bootstrap=trajectory.bootstrap.at[-1].set(jnp.where(cut, trajectory.bootstrap[-1], low)),
+        plan_bootstrap=trajectory.plan_bootstrap.at[-1].set(jnp.where(cut, trajectory.plan_bootstrap[-1], high)),
+    )

@@ -1,0 +1,345 @@
+"""Training: one iteration of collection and learning as one pure function (paper, "Algorithm").
+
+Axes: **E** environments, **T** time steps, **L** levels, **M** tasks per level, **V**, **S**, **B** as in ``batch.py``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from hrlspec import curriculum, ppo
+from hrlspec.agent import Agent, Params
+from hrlspec.batch import LowBatch, PlanBatch, build, plan_state
+from hrlspec.config import PPOConfig
+from hrlspec.curriculum import Curriculum
+from hrlspec.interaction import Decision, start
+from hrlspec.rewards import RewardMachine
+from hrlspec.rollout import Collector, Trajectory, collect
+from hrlspec.spec import TaskTree, subtask_avoid
+
+Metrics = dict[str, jax.Array]
+
+
+@struct.dataclass
+class TrainState:
+    """Everything a run needs to go on, bit for bit.
+
+    Attributes:
+        params: parameters of the three networks.
+        optimisers: their optimiser states, under the same names.
+        collector: running episodes.
+        tasks: the tasks of those episodes, leading axis E.
+        curriculum: level and window.
+        key: base key; iteration i uses ``fold_in(key, i)``.
+        iteration: int32 ``[]``, iterations done. Environment steps are this times E·T, multiplied in Python.
+    """
+
+    params: Params
+    optimisers: dict[str, Any]
+    collector: Collector
+    tasks: TaskTree
+    curriculum: Curriculum
+    key: jax.Array
+    iteration: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Trainer:
+    """Pure training functions for one agent and one reward.
+
+    ``bank`` arguments are :func:`hrlspec.curriculum.draw_bank`'s: L·M tasks, drawn anew as often as wanted.
+
+    Attributes:
+        agent: networks, environment and configuration.
+    """
+
+    agent: Agent
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def init(self, key: jax.Array, bank: TaskTree, machine: RewardMachine) -> TrainState:
+        """A fresh state. The key is consumed."""
+        config, env = self.agent.config, self.agent.env
+        key, init_key, layout_key, reset_key, stagger_key = jax.random.split(key, 5)
+        params = self.agent.init(init_key)
+        envs = jnp.arange(config.num_envs)
+
+        def keys(key: jax.Array) -> jax.Array:
+            return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, envs)
+
+        tasks = jax.tree.map(lambda x: jnp.asarray(x)[envs % config.curriculum.tasks_per_level], bank)
+        layouts = jax.vmap(env.sample_layout, in_axes=(0, None))(keys(layout_key), env.default_params)
+        worker = start(self.agent, machine, layouts, envs, keys(reset_key), self.agent.open_book(params, tasks))
+        # Staggered clocks: episodes that fail at first would otherwise all be truncated in the same step.
+        elapsed = jax.random.randint(stagger_key, (config.num_envs,), 0, env.horizon)
+        worker = worker.replace(env_state=worker.env_state.replace(time=elapsed.astype(jnp.int32)))
+        # The very first sub-tasks are each task's first edge: not the planner's choice, hence no decision.
+        worker = worker.replace(assigned=jnp.ones(config.num_envs, jnp.int32), awaiting=jnp.zeros(config.num_envs, bool))
+        zeros = jnp.zeros(config.num_envs, jnp.int32)
+        decision = Decision(made=zeros > 0, log_prob=jnp.zeros(config.num_envs), value=jnp.zeros(config.num_envs))
+        transforms = self._transforms()
+        return TrainState(
+            params=params,
+            optimisers={name: transforms[name].init(params[name]) for name in params},
+            collector=Collector(worker=worker, decision=decision, level=zeros, started=zeros),
+            tasks=tasks,
+            curriculum=curriculum.initial(),
+            key=key,
+            iteration=jnp.int32(0),
+        )
+
+    @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
+    def iterate(
+        self, state: TrainState, bank: TaskTree, machine: RewardMachine, reserved: jax.Array
+    ) -> tuple[TrainState, Metrics]:
+        """One iteration: E×T steps of collection, then updates of all networks. ``state`` is donated.
+
+        Args:
+            state: where the run stands.
+            bank: training tasks, leading axis L·M.
+            machine: the rewards.
+            reserved: uint32, sorted hashes of held-out tasks, which relabelling must not produce.
+
+        Returns:
+            The next state and float32 metrics: sums over finished episodes (``episodes``, ``successes``,
+            ``returns``, ``lengths``), ``violations`` and ``shielded`` per step, the level, and losses.
+        """
+        agent, config = self.agent, self.agent.config
+        keys = jax.random.split(jax.random.fold_in(state.key, state.iteration), 5)
+        book = agent.open_book(state.params, jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank))
+        collector = state.collector.replace(
+            worker=state.collector.worker.replace(task=jnp.arange(config.num_envs, dtype=jnp.int32))
+        )
+        pool = self._pool(keys[0])
+        collector, trajectory = collect(
+            keys[1], agent, state.params, machine, book, collector, pool, state.curriculum.level
+        )
+        low, plan = build(keys[2], agent, state.params, machine, book, trajectory, reserved)
+        params, optimisers, losses = self._learn(keys[3], state, low, plan, trajectory)
+        ended = trajectory.terminated | trajectory.truncated
+        current = ended & (trajectory.level == state.curriculum.level)
+        new_curriculum = curriculum.update(
+            state.curriculum, current.sum(), (current & trajectory.satisfied).sum(), config.curriculum
+        )
+        metrics = losses | _summary(trajectory, ended) | {"level": 1.0 + state.curriculum.level}
+        new_state = TrainState(
+            params=params,
+            optimisers=optimisers,
+            collector=collector,
+            tasks=jax.tree.map(lambda x: x[collector.worker.task], book.tree),
+            curriculum=new_curriculum,
+            key=state.key,
+            iteration=state.iteration + 1,
+        )
+        return new_state, metrics
+
+    def _transforms(self) -> dict[str, optax.GradientTransformation]:
+        config = self.agent.config
+        return {
+            "planner": ppo.optimiser(config.high.max_grad_norm),
+            "controller": ppo.optimiser(config.low.max_grad_norm),
+            "reach_critic": ppo.optimiser(1.0),
+        }
+
+    def _pool(self, key: jax.Array) -> Any:
+        """Fresh layouts for the resets of one iteration, ``[E, S, ...]``."""
+        env, config = self.agent.env, self.agent.config
+        size = max(2, config.num_steps // 4)
+
+        def one(index: jax.Array) -> Any:
+            keys = jax.random.split(jax.random.fold_in(key, index), size)
+            return jax.vmap(env.sample_layout, in_axes=(0, None))(keys, env.default_params)
+
+        return jax.vmap(one)(jnp.arange(config.num_envs))
+
+    def _learn(
+        self, key: jax.Array, state: TrainState, low: LowBatch, plan: PlanBatch, trajectory: Trajectory
+    ) -> tuple[Params, dict[str, Any], Metrics]:
+        """Updates the three networks; metrics are means over the gradient steps."""
+        agent, config = self.agent, self.agent.config
+        progress = state.iteration / config.num_iterations
+        transforms = self._transforms()
+        keys = jax.random.split(key, 3)
+        params, optimisers, metrics = dict(state.params), dict(state.optimisers), {}
+
+        def train(name: str, key: jax.Array, batch: Any, settings: PPOConfig, loss: Callable[..., Any]) -> None:
+            rate, entropy = ppo.annealed_rates(settings, progress)
+            params[name], optimisers[name], result = _fit(
+                key,
+                lambda p, sample: loss(agent, p, sample, settings, entropy),
+                params[name],
+                optimisers[name],
+                transforms[name],
+                rate,
+                batch,
+                settings.epochs,
+                settings.minibatches,
+            )
+            metrics.update({f"{name}/{k}": v for k, v in result.items()})
+
+        if config.network.advice:
+            # The planner must see the advice that its decisions were based on.
+            plan = (plan, _advice(agent, state.params, plan))
+        else:
+            plan = (plan, jnp.zeros(plan.tree.parent.shape))
+        train("controller", keys[0], low, config.low, controller_loss)
+        train("planner", keys[1], plan, config.high, planner_loss)
+        if config.shield.mode != "off":
+            settings = PPOConfig(
+                learning_rate=config.shield.learning_rate,
+                final_learning_rate=config.shield.learning_rate,
+                epochs=1,
+                minibatches=config.shield.minibatches,
+            )
+            batch = reach_batch(agent, state.params, trajectory)
+            train("reach_critic", keys[2], batch, settings, reach_loss)
+        return params, optimisers, metrics
+
+
+def controller_loss(
+    agent: Agent, params: Any, batch: LowBatch, settings: PPOConfig, entropy_weight: jax.Array
+) -> tuple[jax.Array, Metrics]:
+    """PPO loss of the low level on a minibatch ``[V, T]``; steps the shield replaced count for the value alone."""
+    own = {"controller": params}
+    future = jax.vmap(jax.vmap(agent.embed_task, in_axes=(None, 0)), in_axes=(None, 0))(own, batch.tree)
+    avoid = jax.vmap(jax.vmap(subtask_avoid))(batch.tree)
+    row = jnp.arange(batch.slot.shape[0])[:, None]
+    conditions = tuple(x[row, batch.slot, batch.edge] for x in (batch.tree.reach, avoid, future))
+    view, conditions = jax.tree.map(flat, (batch.view, conditions))
+    logits, value = jax.vmap(agent.control, in_axes=(None, 0, 0, 0, 0))(own, view, *conditions)
+    log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), flat(batch.action)[:, None], 1)[:, 0]
+    on_policy, valid = flat(batch.on_policy), flat(batch.valid)
+    advantage = ppo.normalise(flat(batch.advantage), on_policy)
+    policy = ppo.policy_loss(log_prob, flat(batch.log_prob), advantage, on_policy, settings.clip)
+    value_loss = ppo.masked_mean((value - flat(batch.target)) ** 2, valid)
+    randomness = ppo.masked_mean(ppo.entropy(logits), on_policy)
+    loss = policy + settings.value_coefficient * value_loss - entropy_weight * randomness
+    return loss, {"policy_loss": policy, "value_loss": value_loss, "entropy": randomness}
+
+
+def planner_loss(
+    agent: Agent, params: Any, batch: tuple[PlanBatch, jax.Array], settings: PPOConfig, entropy_weight: jax.Array
+) -> tuple[jax.Array, Metrics]:
+    """PPO and TransE loss of the planner on a minibatch ``[B]`` (eqs. 4 and 5)."""
+    config, planner = agent.config, agent.planner
+    batch, advice = batch
+    logits, value = jax.vmap(planner.apply, in_axes=(None, 0, 0, 0, 0))(
+        params, batch.view, batch.tree, plan_state(batch), advice
+    )
+    log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), batch.edge[:, None], 1)[:, 0]
+    advantage = ppo.normalise(batch.advantage, batch.valid)
+    policy = ppo.policy_loss(log_prob, batch.log_prob, advantage, batch.valid, settings.clip)
+    value_loss = ppo.masked_mean((value - batch.target) ** 2, batch.valid)
+    randomness = ppo.masked_mean(ppo.entropy(logits), batch.valid)
+    loss = policy + settings.value_coefficient * value_loss - entropy_weight * randomness
+    metrics = {"policy_loss": policy, "value_loss": value_loss, "entropy": randomness}
+    if config.transe:
+        metrics["transe_loss"] = transe_loss(agent, params, batch)
+        loss = loss + config.transe * metrics["transe_loss"]
+    return loss, metrics
+
+
+def transe_loss(agent: Agent, params: Any, batch: PlanBatch) -> jax.Array:
+    """Predicted latents near the ones reached, other states' latents at least the margin away (eq. 4)."""
+    planner = agent.planner
+
+    def encode(view: Any) -> jax.Array:
+        return jax.vmap(lambda v: planner.apply(params, v, method="encode"))(view)
+
+    here, there = encode(batch.view), encode(batch.next_view)
+    predicted = jax.vmap(lambda h, r: planner.apply(params, h, r, method="predict"))(here, batch.reached)
+    error = _distance(predicted, there)
+    other = _distance(here, jnp.roll(here, 1, axis=0))
+    both = batch.valid & jnp.roll(batch.valid, 1)
+    margin = jnp.maximum(0.0, agent.config.transe_margin - other)
+    return ppo.masked_mean(error, batch.valid & batch.completed) + ppo.masked_mean(margin, both)
+
+
+def flat(x: jax.Array) -> jax.Array:
+    """Merges the two leading axes (zero-sized arrays too)."""
+    return x.reshape((x.shape[0] * x.shape[1], *x.shape[2:]))
+
+
+def _distance(x: jax.Array, y: jax.Array) -> jax.Array:
+    """Euclidean distance over the last axis, with a finite gradient at zero."""
+    return jnp.sqrt(((x - y) ** 2).sum(-1) + 1e-8)
+
+
+def reach_batch(agent: Agent, params: Params, trajectory: Trajectory) -> tuple[Any, ...]:
+    """Q-learning data for all goals from every transition, leading axis E·T.
+
+    The target is 1 where the goal holds after the step, else discount · max_a Q(s', g, a). At an episode's
+    end s' is another episode's first state, so only goals that were reached count there.
+    """
+    values = jax.vmap(jax.vmap(lambda v: agent.reach_values(params, v).max(-1)))(trajectory.view)
+    ended = (trajectory.terminated | trajectory.truncated).at[-1].set(True)
+    ahead = agent.config.shield.discount * jnp.roll(values, -1, axis=0)
+    target = jnp.where(trajectory.labels, 1.0, ahead)
+    known = trajectory.labels | ~ended[..., None]
+    batch = trajectory.view, trajectory.action, target, known
+    return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), batch)
+
+
+def reach_loss(
+    agent: Agent, params: Any, batch: tuple[Any, ...], settings: PPOConfig, entropy_weight: jax.Array
+) -> tuple[jax.Array, Metrics]:
+    """Squared error of Q(s, g, a) for all goals g (paper, "Avoiding Propositions")."""
+    del settings, entropy_weight
+    view, action, target, known = jax.tree.map(flat, batch)
+    values = jax.vmap(lambda v, a: agent.reach_values({"reach_critic": params}, v)[:, a])(view, action)
+    loss = ppo.masked_mean((values - target) ** 2, known)
+    return loss, {"value_loss": loss}
+
+
+def _advice(agent: Agent, params: Params, batch: PlanBatch) -> jax.Array:
+    """The low level's value of every edge's sub-task, ``[B, N]``, at the start of the update."""
+
+    def one(view: Any, tree: TaskTree) -> jax.Array:
+        conditions = tree.reach, subtask_avoid(tree), agent.embed_task(params, tree)
+        return jax.vmap(lambda r, a, f: agent.control(params, view, r, a, f)[1])(*conditions)
+
+    return jax.vmap(one)(batch.view, batch.tree)
+
+
+def _fit(
+    key: jax.Array,
+    loss: Callable[[Any, Any], tuple[jax.Array, Metrics]],
+    params: Any,
+    optimiser_state: Any,
+    transform: optax.GradientTransformation,
+    rate: jax.Array,
+    batch: Any,
+    epochs: int,
+    minibatches: int,
+) -> tuple[Any, Any, Metrics]:
+    """Epochs of minibatch steps over the leading axis of ``batch``, shuffled anew for each."""
+    size = jax.tree.leaves(batch)[0].shape[0]
+    if size % minibatches:
+        raise ValueError(f"{size} rows do not divide into {minibatches} minibatches")
+    order = jnp.argsort(jax.random.bits(key, (epochs, size)), axis=-1).reshape(epochs * minibatches, -1)
+
+    def step(carry: tuple[Any, Any], rows: jax.Array) -> tuple[tuple[Any, Any], Metrics]:
+        sample = jax.tree.map(lambda x: x[rows], batch)
+        params, state, metrics = ppo.gradient_step(lambda p: loss(p, sample), *carry, transform, rate)
+        return (params, state), metrics
+
+    (params, optimiser_state), metrics = jax.lax.scan(step, (params, optimiser_state), order)
+    return params, optimiser_state, jax.tree.map(jnp.mean, metrics)
+
+
+def _summary(trajectory: Trajectory, ended: jax.Array) -> Metrics:
+    """Sums over the rollout's finished episodes, and rates per step."""
+    return {
+        "episodes": ended.sum().astype(jnp.float32),
+        "successes": trajectory.satisfied.sum().astype(jnp.float32),
+        "returns": trajectory.reward.sum(),
+        "violations": (trajectory.terminated & ~trajectory.satisfied).mean(),
+        "shielded": trajectory.shielded.mean(),
+    }
