@@ -2,23 +2,64 @@
 
 from __future__ import annotations
 
+from hrlspec.spec.compiler import compile
+from hrlspec.spec.draw import draw_task
 from hrlspec.spec.hashing import task_hash, task_hashes
 from hrlspec.spec.monitor import RUNNING, SATISFIED, VIOLATED, TaskState, advance, initial, open_edges
+from hrlspec.spec.parser import parse
 from hrlspec.spec.sampling import sample_sequences, sample_trees
+from hrlspec.spec.semantics import satisfies
+from hrlspec.spec.subtasks import Subtask, subtasks
+from hrlspec.spec.syntax import (
+    Achieve,
+    And,
+    Choice,
+    Condition,
+    Ensuring,
+    Formula,
+    Not,
+    Or,
+    Prop,
+    SpecError,
+    SpecWarning,
+    Then,
+)
+from hrlspec.spec.text import to_text, tree_to_formula, tree_to_text
 from hrlspec.spec.tree import TaskTree, subtask_avoid
 
 __all__ = [
     "RUNNING",
     "SATISFIED",
     "VIOLATED",
+    "Achieve",
+    "And",
+    "Choice",
+    "Condition",
+    "Ensuring",
+    "Formula",
+    "Not",
+    "Or",
+    "Prop",
+    "SpecError",
+    "SpecWarning",
+    "Subtask",
     "TaskState",
     "TaskTree",
+    "Then",
     "advance",
+    "compile",
+    "draw_task",
     "initial",
     "open_edges",
+    "parse",
     "sample_sequences",
     "sample_trees",
+    "satisfies",
     "subtask_avoid",
+    "subtasks",
     "task_hash",
     "task_hashes",
+    "to_text",
+    "tree_to_formula",
+    "tree_to_text",
 ]

@@ -51,7 +51,7 @@ class TaskTree:
 
 
 def subtask_avoid(tree: TaskTree) -> jax.Array:
-    """What each sub-task must avoid, bool ``[N, P]`` (eq. 2): its own avoid and what its siblings reach minus its reach.
+    """What each sub-task must avoid, bool ``[N, P]`` (eq. 2): own avoid, and what siblings reach, minus own reach.
 
     For siblings that reach conjunctions this forbids more than eq. (2) does: ¬(b∧c) becomes ¬b and ¬c.
     """
