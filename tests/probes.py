@@ -1,0 +1,222 @@
+"""Probe worlds, probe tasks and tiny configurations whose values are known in closed form.
+
+Also what several tests share: a plain-Python reading of the monitor, and trees cut and written down differently.
+Axes: **L** cells of a corridor, **P** propositions, **N** tree nodes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from envs_jax.base import Box, Discrete, Environment, EnvParams, StepResult
+from hrlspec.config import Config, CurriculumConfig, NetworkConfig, PPOConfig, RelabelConfig, ShieldConfig
+from hrlspec.spec.tree import TaskTree
+from tests.tasks import tree_of
+
+ACHIEVE_A = (0, "a", "")
+
+
+def probe_task(name: str, *, num_propositions: int, num_nodes: int) -> TaskTree:
+    """The probe specifications, as trees."""
+    edges = {
+        "achieve a": [(0, "a", "")],
+        "a; b": [(0, "a", ""), (1, "b", "")],
+        "a or b": [(0, "a", ""), (0, "b", "")],
+        "b or a": [(0, "b", ""), (0, "a", "")],
+        "(a or b); c": [(0, "a", ""), (0, "b", ""), (1, "c", ""), (2, "c", "")],
+        "a ensuring not b": [(0, "a", "b")],
+    }[name]
+    return tree_of(edges, num_propositions=num_propositions, num_nodes=num_nodes)
+
+
+def bank_of(tasks: Sequence[TaskTree], rows: int) -> TaskTree:
+    """A bank of so many rows, the tasks in turn."""
+    return jax.tree.map(lambda *x: np.stack([x[i % len(x)] for i in range(rows)]), *tasks)
+
+
+@struct.dataclass
+class CorridorLayout:
+    """Where an episode starts."""
+
+    start: jax.Array  # int32 []
+
+
+@struct.dataclass
+class CorridorState:
+    position: jax.Array  # int32 []
+    layout: CorridorLayout
+    time: jax.Array  # int32 []
+
+
+@dataclasses.dataclass(frozen=True)
+class Corridor(Environment):
+    """A row of cells, walls at both ends; cell i bears the letters ``cells[i]``, any number of them.
+
+    Actions: 0 left, 1 right. Observation: float32 ``[P + 1, L]``, where each letter lies, and where the agent is.
+    The layout is only the start, drawn from ``starts``: an observation tells position and letters, nothing else.
+    """
+
+    cells: tuple[str, ...] = ("a", "", "", "", "b", "", "c")
+    starts: tuple[int, ...] = (1, 2, 3)
+    horizon: int = 12
+    name: str = "corridor"
+
+    @property
+    def propositions(self) -> tuple[str, ...]:
+        return tuple("abcd")
+
+    @property
+    def table(self) -> np.ndarray:
+        """bool ``[L, P]``, the letters of each cell."""
+        return np.array([[letter in cell for letter in self.propositions] for cell in self.cells])
+
+    @property
+    def observation_shape(self) -> tuple[int, ...]:
+        return (len(self.propositions) + 1, len(self.cells))
+
+    @property
+    def observation_space(self) -> Box:
+        return Box(low=0.0, high=1.0, shape=self.observation_shape)
+
+    @property
+    def action_space(self) -> Discrete:
+        return Discrete(n=2)
+
+    def sample_layout(self, key: jax.Array, params: EnvParams) -> CorridorLayout:
+        return CorridorLayout(jax.random.choice(key, jnp.asarray(self.starts, jnp.int32)))
+
+    def resample_layout(self, key: jax.Array, layout: Any, needed: jax.Array, params: EnvParams) -> CorridorLayout:
+        return jax.tree.map(lambda new, old: jnp.where(needed, new, old), self.sample_layout(key, params), layout)
+
+    def check_layout(self, layout: Any) -> None:
+        if not 0 <= layout.start < len(self.cells):
+            raise ValueError(f"start is {layout.start}")
+
+    def reset_to(self, layout: CorridorLayout, key: jax.Array, params: EnvParams) -> tuple[jax.Array, CorridorState]:
+        state = CorridorState(position=layout.start, layout=layout, time=jnp.int32(0))
+        return self.observation(state, params), state
+
+    def step_env(self, key: jax.Array, state: CorridorState, action: jax.Array, params: EnvParams) -> StepResult:
+        position = jnp.clip(state.position + 2 * action - 1, 0, len(self.cells) - 1).astype(jnp.int32)
+        state = state.replace(position=position, time=state.time + 1)
+        truncated = state.time >= params.horizon
+        return self.observation(state, params), state, jnp.float32(0.0), jnp.bool_(False), truncated, {}
+
+    def labels(self, state: CorridorState, params: EnvParams) -> jax.Array:
+        return jnp.asarray(self.table)[state.position]
+
+    def observation(self, state: CorridorState, params: EnvParams) -> jax.Array:
+        here = jnp.arange(len(self.cells)) == state.position
+        return jnp.concatenate([jnp.asarray(self.table).T, here[None]]).astype(jnp.float32)
+
+    def proposition_view(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return observation[:-1], observation[-1]
+
+    def view_at(self, position: Any) -> tuple[jax.Array, jax.Array]:
+        """The view from given cells (int, any leading axes)."""
+        position = jnp.asarray(position)
+        planes = jnp.broadcast_to(jnp.asarray(self.table.T, jnp.float32), (*position.shape, *self.table.T.shape))
+        return planes, jax.nn.one_hot(position, len(self.cells))
+
+
+def small_config(**changes: Any) -> Config:
+    """Every technique on, as small as it goes; compiled programs are shared by tests that change nothing."""
+    ppo = PPOConfig(learning_rate=5e-3, final_learning_rate=5e-3, epochs=2, minibatches=2)
+    config = Config(
+        num_envs=16,
+        num_steps=24,
+        total_steps=10**6,
+        discount=0.9,
+        planner_share=4,
+        group=8,
+        low=dataclasses.replace(ppo, entropy=0.003, final_entropy=0.003),
+        high=dataclasses.replace(ppo, entropy=0.003, final_entropy=0.003),
+        network=NetworkConfig(
+            latent=16,
+            conv_channels=(),
+            encoder_mlp=(32,),
+            planner_features=16,
+            planner_hidden=16,
+            planner_rounds=0,
+            task_features=8,
+            task_rounds=0,
+            actor=(32,),
+            critic=(32,),
+            reach_critic=(32,),
+        ),
+        curriculum=CurriculumConfig(levels=2, tasks_per_level=16, max_nodes=6, window=64),
+        relabel=RelabelConfig(),
+        shield=ShieldConfig(minibatches=2),
+    )
+    return dataclasses.replace(config, **changes)
+
+
+def pairs(flags: Any) -> set[int]:
+    """The indices of the propositions that are true."""
+    return set(np.flatnonzero(np.asarray(flags)).tolist())
+
+
+def read_monitor(
+    tree: TaskTree, node: int, blocked: set[int], labels: set[int], assigned: int
+) -> tuple[int, set[int], str]:
+    """One step of the committed reading, in plain Python: new node, blocked edges, and how the task stands."""
+    edges = [k for k in range(tree.num_nodes) if tree.valid[k] and tree.parent[k] == node and k not in blocked]
+    blocked = blocked | {k for k in edges if pairs(tree.avoid[k]) & labels}
+    edges = [k for k in edges if k not in blocked]
+    met = [k for k in edges if pairs(tree.reach[k]) <= labels]
+    if met:
+        best = assigned if assigned in met else min(met, key=lambda k: (-len(pairs(tree.reach[k])), k))
+        return best, set(), "satisfied" if tree.accepting[best] else "running"
+    return node, blocked, "running" if edges else "violated"
+
+
+def reordered(tree: TaskTree, order: Sequence[int]) -> TaskTree:
+    """The same task with node ``order[i]`` written in row i; ``order`` must keep parents before children."""
+    order = np.asarray(order)
+    row = np.argsort(order)
+    moved = jax.tree.map(lambda x: np.asarray(x)[order], tree)
+    return moved.replace(parent=np.where(moved.parent >= 0, row[moved.parent], TaskTree.NO_NODE).astype(np.int32))
+
+
+def random_order(rng: np.random.Generator, tree: TaskTree) -> np.ndarray:
+    """A random order of the nodes in which parents come before children; padding anywhere but first."""
+    waiting, order = list(range(1, tree.num_nodes)), [0]
+    while waiting:
+        ready = [k for k in waiting if tree.parent[k] < 0 or tree.parent[k] in order]
+        order.append(int(rng.choice(ready)))
+        waiting.remove(order[-1])
+    return np.array(order)
+
+
+def subtree(tree: TaskTree, node: int, num_nodes: int) -> tuple[TaskTree, list[int]]:
+    """The progression at a node as a tree of its own, and which of the original rows became its rows."""
+    tree = jax.tree.map(np.asarray, tree)
+    rows = [node]
+    for k in range(tree.num_nodes):
+        if tree.valid[k] and tree.parent[k] in rows:
+            rows.append(k)
+    cut = jax.tree.map(lambda x: np.concatenate([x[rows], np.zeros((num_nodes - len(rows), *x.shape[1:]), x.dtype)]), tree)
+    parent = np.full(num_nodes, TaskTree.NO_NODE, np.int32)
+    parent[1 : len(rows)] = [rows.index(int(p)) for p in tree.parent[rows[1:]]]
+    used = np.arange(num_nodes) > 0
+    return cut.replace(
+        parent=parent,
+        reach=cut.reach & used[:, None],
+        avoid=cut.avoid & used[:, None],
+        accepting=cut.accepting & used,
+        depth=np.where(parent >= 0, cut.depth - tree.depth[node], 0).astype(np.int32),
+    ), rows
+
+
+def padded(tree: TaskTree, num_nodes: int) -> TaskTree:
+    """The same task with more padding."""
+    extra = num_nodes - tree.num_nodes
+    wide = jax.tree.map(lambda x: np.concatenate([x, np.zeros((extra, *x.shape[1:]), x.dtype)]), jax.tree.map(np.asarray, tree))
+    return wide.replace(parent=np.where(wide.valid & (np.arange(num_nodes) > 0), wide.parent, TaskTree.NO_NODE))
