@@ -1,0 +1,44 @@
+"""Evaluation: success, SPL, return over optimum and contested choice on unseen tasks (DESIGN §7)."""
+
+from __future__ import annotations
+
+from hrlspec.evaluation.aggregate import Aggregate, aggregate
+from hrlspec.evaluation.cases import BranchCases, Cases, is_finite, make_branch_cases, make_cases
+from hrlspec.evaluation.protocol import (
+    ChoiceEvaluation,
+    ReturnEvaluation,
+    SuiteEvaluation,
+    choice_evaluation,
+    evaluate_suite,
+    final_evaluation,
+    periodic_evaluation,
+    return_evaluation,
+)
+from hrlspec.evaluation.results import ChoiceResult, ReturnResult, Score, SuiteResult, TaskScore
+from hrlspec.evaluation.suite import Suite, suite_from_text, suite_from_trees
+
+__all__ = [
+    "Aggregate",
+    "BranchCases",
+    "Cases",
+    "ChoiceEvaluation",
+    "ChoiceResult",
+    "ReturnEvaluation",
+    "ReturnResult",
+    "Score",
+    "Suite",
+    "SuiteEvaluation",
+    "SuiteResult",
+    "TaskScore",
+    "aggregate",
+    "choice_evaluation",
+    "evaluate_suite",
+    "final_evaluation",
+    "is_finite",
+    "make_branch_cases",
+    "make_cases",
+    "periodic_evaluation",
+    "return_evaluation",
+    "suite_from_text",
+    "suite_from_trees",
+]

@@ -1,0 +1,239 @@
+"""What an agent is evaluated on: tasks in layouts, with the optima against which it is measured.
+
+Everything here is computed once and used for any number of agents.
+
+Axes: **M** tasks, **B** cases, **N** tree nodes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hrlspec import solver
+from hrlspec.evaluation.suite import Suite
+from hrlspec.rewards import RewardMachine
+from hrlspec.solver import Graph, tabulate
+from hrlspec.spec import TaskTree
+from hrlspec.yardsticks import branch_scores, myopic_steps
+
+LAYOUTS_PER_TASK = 10
+MOST_ROUNDS = 20
+"""Draws of ``layouts_per_task`` layouts for a task before it is taken to be impossible (or nearly)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Cases:
+    """B episodes to run: a task in a layout each.
+
+    Attributes:
+        suite: the tasks.
+        task: int ``[B]``, rows of the suite.
+        layouts: a layout pytree, numpy leaves with leading axis B.
+        optimum: float32 ``[B]``, least steps to satisfaction (committed reading), or ``None`` where the environment
+            has no exact solver.
+        myopic: float32 ``[B]``, steps of the agent that always goes to the nearest goal, inf where it fails, or
+            ``None`` likewise.
+        excluded: pairs of task and layout that were drawn and left out because nothing satisfies the task within
+            the horizon.
+    """
+
+    suite: Suite
+    task: np.ndarray
+    layouts: Any
+    optimum: np.ndarray | None
+    myopic: np.ndarray | None
+    excluded: int
+
+    def __len__(self) -> int:
+        """B."""
+        return len(self.task)
+
+    @property
+    def trees(self) -> TaskTree:
+        """The task of each case, leading axis B."""
+        trees: TaskTree = jax.tree.map(lambda x: x[self.task], self.suite.trees)
+        return trees
+
+
+@dataclasses.dataclass(frozen=True)
+class BranchCases:
+    """B cases under a reward set in which the choice of the first edge matters.
+
+    Attributes:
+        suite: the tasks.
+        task: int ``[B]``, rows of the suite.
+        layouts: a layout pytree, numpy leaves with leading axis B.
+        optimum: float32 ``[B]``, the largest undiscounted return within the horizon.
+        random: float32 ``[B]``, expected return of an agent that draws its first edge uniformly and is optimal then.
+        longest: float32 ``[B]``, return of one that takes the longest branch and is optimal then.
+        excluded: pairs of task and layout that were drawn and left out because the branches' optima are too alike.
+    """
+
+    suite: Suite
+    task: np.ndarray
+    layouts: Any
+    optimum: np.ndarray
+    random: np.ndarray
+    longest: np.ndarray
+    excluded: int
+
+    def __len__(self) -> int:
+        """B."""
+        return len(self.task)
+
+    @property
+    def trees(self) -> TaskTree:
+        """The task of each case, leading axis B."""
+        trees: TaskTree = jax.tree.map(lambda x: x[self.task], self.suite.trees)
+        return trees
+
+
+def is_finite(env: Any) -> bool:
+    """Whether the environment is a finite labelled graph, so that optima are known."""
+    return hasattr(env, "transition_table")
+
+
+def make_cases(
+    env: Any, suite: Suite, *, layouts_per_task: int = LAYOUTS_PER_TASK, seed: int = 0, optima: bool = True
+) -> Cases:
+    """Draws layouts for each task of a suite and solves them.
+
+    A task's layouts depend on the task and the seed alone, not on the rest of the suite. Where an exact solver knows
+    that a task cannot be satisfied within the horizon the layout is left out, counted, and another one drawn, so
+    every task has the same number of cases.
+
+    Args:
+        env: the environment.
+        suite: the tasks.
+        layouts_per_task: cases of each task.
+        seed: of the layouts.
+        optima: whether to solve at all; without it no layout is left out.
+
+    Raises:
+        ValueError: if a task cannot be satisfied in (nearly) any layout.
+    """
+    solve = optima and is_finite(env)
+    kept: list[list[tuple[Any, float, float]]] = [[] for _ in range(len(suite))]
+    excluded = 0
+    for draw in range(MOST_ROUNDS):
+        wanting = [row for row in range(len(suite)) if len(kept[row]) < layouts_per_task]
+        if not wanting:
+            break
+        pool = draw_layouts(env, suite, layouts_per_task, seed=seed, draw=draw)
+        graph = tabulate(env, pool) if solve else None
+        for row in wanting:
+            cells = range(row * layouts_per_task, (row + 1) * layouts_per_task)
+            optimum, myopic = _solve(graph, suite, row, layouts_per_task)
+            possible = optimum <= env.horizon
+            excluded += int((~possible).sum())
+            fresh = [
+                (jax.tree.map(lambda x, cell=cell: x[cell], pool), optimum[i], myopic[i])
+                for i, cell in enumerate(cells)
+                if possible[i]
+            ]
+            kept[row] += fresh[: layouts_per_task - len(kept[row])]
+    for row, found in enumerate(kept):
+        if len(found) < layouts_per_task:
+            raise ValueError(
+                f"task {suite.formulas[row]!r} can be satisfied within {env.horizon} steps in only {len(found)} of "
+                f"{layouts_per_task * MOST_ROUNDS} layouts of {env.name}, expected at least {layouts_per_task}"
+            )
+    flat = [case for found in kept for case in found]
+    layouts = jax.tree.map(lambda *leaves: np.stack(leaves), *[case[0] for case in flat])
+    return Cases(
+        suite=suite,
+        task=np.repeat(np.arange(len(suite)), layouts_per_task),
+        layouts=layouts,
+        optimum=np.array([case[1] for case in flat], np.float32) if solve else None,
+        myopic=np.array([case[2] for case in flat], np.float32) if solve else None,
+        excluded=excluded,
+    )
+
+
+def make_branch_cases(
+    env: Any,
+    suite: Suite,
+    machine: RewardMachine,
+    *,
+    layouts_per_task: int = LAYOUTS_PER_TASK,
+    seed: int = 0,
+    least_difference: float = 0.3,
+) -> BranchCases:
+    """Draws layouts and keeps those in which the branches' optimal returns differ.
+
+    Unlike :func:`make_cases` it draws no others: in how many layouts the branch matters is the task's nature.
+
+    Args:
+        env: a finite environment.
+        suite: the tasks.
+        machine: the rewards.
+        layouts_per_task: layouts drawn for each task.
+        seed: of the layouts.
+        least_difference: see :func:`hrlspec.yardsticks.branch_scores`.
+
+    Raises:
+        ValueError: if the environment has no exact solver or no case is left.
+    """
+    if not is_finite(env):
+        raise ValueError(f"{env.name} has no exact solver, so return over optimum is not known")
+    pool = draw_layouts(env, suite, layouts_per_task, seed=seed)
+    graph = tabulate(env, pool)
+    parts = [
+        branch_scores(
+            graph[row * layouts_per_task : (row + 1) * layouts_per_task],
+            task_of(suite, row),
+            machine,
+            env.horizon,
+            least_difference=least_difference,
+        )
+        for row in range(len(suite))
+    ]
+    optimal, random, longest, matters = (np.concatenate(column) for column in zip(*parts, strict=True))
+    if not matters.any():
+        raise ValueError(f"{suite.name}: the branch matters in none of {len(matters)} cases")
+    return BranchCases(
+        suite=suite,
+        task=np.repeat(np.arange(len(suite)), layouts_per_task)[matters],
+        layouts=jax.tree.map(lambda x: x[matters], pool),
+        optimum=optimal[matters],
+        random=random[matters],
+        longest=longest[matters],
+        excluded=int((~matters).sum()),
+    )
+
+
+def task_of(suite: Suite, row: int) -> TaskTree:
+    """One task of a suite, unbatched."""
+    tree: TaskTree = jax.tree.map(lambda x: x[row], suite.trees)
+    return tree
+
+
+def draw_layouts(env: Any, suite: Suite, layouts_per_task: int, *, seed: int = 0, draw: int = 0) -> Any:
+    """Layouts for each task in turn, numpy leaves with leading axis M · ``layouts_per_task``."""
+    count = np.arange(draw * layouts_per_task, (draw + 1) * layouts_per_task)
+    layouts = _layouts(env, jax.random.key(seed), suite.hashes, count.astype(np.uint32))
+    return jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[2:]), layouts)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _layouts(env: Any, key: jax.Array, hashes: jax.Array, count: jax.Array) -> Any:
+    """Leading axes M and ``layouts_per_task``."""
+
+    def one(task: jax.Array, number: jax.Array) -> Any:
+        return env.sample_layout(jax.random.fold_in(jax.random.fold_in(key, task), number), env.default_params)
+
+    return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(jnp.asarray(hashes), count)
+
+
+def _solve(graph: Graph | None, suite: Suite, row: int, layouts_per_task: int) -> tuple[np.ndarray, np.ndarray]:
+    """Least steps and the myopic agent's, zeros without a graph."""
+    if graph is None:
+        return np.zeros(layouts_per_task), np.zeros(layouts_per_task)
+    part, tree = graph[row * layouts_per_task : (row + 1) * layouts_per_task], task_of(suite, row)
+    return solver.optimal_steps(part, tree), myopic_steps(part, tree)

@@ -1,0 +1,225 @@
+"""What evaluations report, and its JSON form.
+
+Intervals cover 95 % and widen for episodes of one task being alike (:mod:`hrlspec.stats`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from hrlspec.stats import Interval
+
+ESTIMATES = ("success_rate", "violation_rate", "return_mean", "steps_mean", "spl")
+"""The estimates of a :class:`Score`; each has ``<name>_interval`` beside it in JSON."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Score:
+    """Episodes summed up.
+
+    Attributes:
+        episodes: how many.
+        success_rate: task satisfied within the horizon.
+        violation_rate: task violated, or episode ended by the environment.
+        return_mean: undiscounted sum of rewards.
+        steps_mean: steps of the successful episodes, all NaN when there is none.
+        spl: success weighted by path length: the mean of success × L*/max(taken, L*), L* the least number of steps in
+            the committed reading. ``None`` where L* is not known.
+        myopic_success_rate: success rate, on the same cases, of the agent that always goes to the nearest goal, or
+            ``None`` likewise.
+        myopic_spl: SPL of that agent, or ``None`` likewise.
+    """
+
+    episodes: int
+    success_rate: Interval
+    violation_rate: Interval
+    return_mean: Interval
+    steps_mean: Interval
+    spl: Interval | None
+    myopic_success_rate: float | None
+    myopic_spl: float | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain numbers and lists; what is not known or cannot be estimated is ``None``."""
+        result: dict[str, Any] = {"episodes": self.episodes}
+        for name in ESTIMATES:
+            result |= interval_to_json(name, getattr(self, name))
+        return result | {"myopic_success_rate": self.myopic_success_rate, "myopic_spl": self.myopic_spl}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Score:
+        """The inverse of :meth:`to_json`."""
+        estimates = {name: interval_from_json(name, data) for name in ESTIMATES}
+        if data["spl"] is None:
+            estimates["spl"] = None  # type: ignore[assignment]
+        return cls(
+            episodes=data["episodes"],
+            myopic_success_rate=data["myopic_success_rate"],
+            myopic_spl=data["myopic_spl"],
+            **estimates,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskScore:
+    """The score on one task.
+
+    Attributes:
+        task: its SPECTRL.
+        depth: edges on its longest path.
+        score: on its episodes.
+    """
+
+    task: str
+    depth: int
+    score: Score
+
+
+@dataclasses.dataclass(frozen=True)
+class SuiteResult:
+    """How an agent did on a suite.
+
+    Attributes:
+        suite: its name.
+        greedy: whether actions and sub-tasks were the most likely ones rather than sampled.
+        shield: whether the shield was on.
+        excluded: pairs of task and layout left out because the task cannot be satisfied within the horizon.
+        total: over all episodes.
+        per_depth: over the tasks of each depth.
+        per_task: for each task of the suite, in its order.
+    """
+
+    suite: str
+    greedy: bool
+    shield: bool
+    excluded: int
+    total: Score
+    per_depth: Mapping[int, Score]
+    per_task: tuple[TaskScore, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """A dictionary for ``json.dumps``: the total's entries on top, ``per_depth`` by depth, a list ``per_task``."""
+        return {
+            "suite": self.suite,
+            "actions": "greedy" if self.greedy else "sampled",
+            "shield": self.shield,
+            "excluded": self.excluded,
+            **self.total.to_json(),
+            "per_depth": {str(depth): score.to_json() for depth, score in self.per_depth.items()},
+            "per_task": [{"task": each.task, "depth": each.depth, **each.score.to_json()} for each in self.per_task],
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> SuiteResult:
+        """The inverse of :meth:`to_json`."""
+        return cls(
+            suite=data["suite"],
+            greedy=data["actions"] == "greedy",
+            shield=data["shield"],
+            excluded=data["excluded"],
+            total=Score.from_json(data),
+            per_depth={int(depth): Score.from_json(score) for depth, score in data["per_depth"].items()},
+            per_task=tuple(TaskScore(each["task"], each["depth"], Score.from_json(each)) for each in data["per_task"]),
+        )
+
+    def metrics(self, prefix: str = "eval/") -> dict[str, float]:
+        """The headline numbers for a metrics file; NaN where there is no estimate, nothing for SPL where unknown."""
+        names = ("return_mean", "success_rate", "steps_mean") + (("spl",) if self.total.spl is not None else ())
+        return {prefix + name: getattr(self.total, name).estimate for name in names}
+
+
+@dataclasses.dataclass(frozen=True)
+class ReturnResult:
+    """Return over optimum where the branch matters (DESIGN §7).
+
+    The ratio is taken case by case, undiscounted return divided by the optimum within the horizon, and then averaged
+    over cases, so that tasks with large returns count no more than others.
+
+    Attributes:
+        suite: its name.
+        greedy: whether actions and sub-tasks were the most likely ones rather than sampled.
+        episodes: how many cases.
+        excluded: pairs of task and layout left out because their branches' optima differ too little.
+        ratio: of the agent.
+        success_rate: of the agent on the same episodes.
+        random_branch: ratio of an agent that draws its first edge uniformly and is optimal from then on.
+        longest_branch: ratio of one that takes the longest branch and is optimal from then on.
+        per_depth: the agent's ratio by depth of the task.
+    """
+
+    suite: str
+    greedy: bool
+    episodes: int
+    excluded: int
+    ratio: Interval
+    success_rate: Interval
+    random_branch: float
+    longest_branch: float
+    per_depth: Mapping[int, Interval]
+
+    def to_json(self) -> dict[str, Any]:
+        """A dictionary for ``json.dumps``."""
+        return {
+            "suite": self.suite,
+            "actions": "greedy" if self.greedy else "sampled",
+            "episodes": self.episodes,
+            "excluded": self.excluded,
+            **interval_to_json("return_over_optimum", self.ratio),
+            **interval_to_json("success_rate", self.success_rate),
+            "random_branch": self.random_branch,
+            "longest_branch": self.longest_branch,
+            "per_depth": {
+                str(depth): interval_to_json("return_over_optimum", ratio) for depth, ratio in self.per_depth.items()
+            },
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class ChoiceResult:
+    """Contested choice (DESIGN §7): the mean of the two rates of right choices.
+
+    Always taking the nearest instance scores 0.5, and so does always taking a farther one.
+
+    Attributes:
+        greedy: whether actions and sub-tasks were the most likely ones rather than sampled.
+        episodes: how many cases, half of them contested.
+        score: the mean of the two rates below.
+        contested: rate of right choices where the nearest instance is wrong.
+        controls: rate where it is right.
+        failures: share of episodes whose task was not satisfied; they count as wrong.
+    """
+
+    greedy: bool
+    episodes: int
+    score: Interval
+    contested: Interval
+    controls: Interval
+    failures: float
+
+    def to_json(self) -> dict[str, Any]:
+        """A dictionary for ``json.dumps``."""
+        return {
+            "actions": "greedy" if self.greedy else "sampled",
+            "episodes": self.episodes,
+            **interval_to_json("contested_choice", self.score),
+            **interval_to_json("contested_right", self.contested),
+            **interval_to_json("control_right", self.controls),
+            "failure_rate": self.failures,
+        }
+
+
+def interval_to_json(name: str, interval: Interval | None) -> dict[str, Any]:
+    """``{name: estimate, name_interval: [low, high]}``, with ``None`` for NaN."""
+    if interval is None:
+        return {name: None, f"{name}_interval": None}
+    estimate, low, high = (None if math.isnan(number) else float(number) for number in interval)
+    return {name: estimate, f"{name}_interval": [low, high]}
+
+
+def interval_from_json(name: str, data: Mapping[str, Any]) -> Interval:
+    """The inverse of :func:`interval_to_json` for an interval, unknown numbers as NaN."""
+    low, high = data[f"{name}_interval"] or (None, None)
+    return Interval(*(math.nan if number is None else number for number in (data[name], low, high)))

@@ -1,0 +1,119 @@
+"""Test suites: named lists of tasks, read from SPECTRL text or made of trees.
+
+Axes: **M** tasks, **N** tree nodes, **P** atomic propositions.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from hrlspec.spec import TaskTree, task_hashes
+from hrlspec.spec.compiler import compile as compile_formula
+from hrlspec.spec.parser import parse
+from hrlspec.spec.syntax import SpecError
+from hrlspec.spec.text import tree_to_text
+
+MAX_NODES = 256
+"""Largest tree that a suite may hold unless told otherwise."""
+
+NODES_MULTIPLE = 8
+"""Suites are padded to a multiple of this, so that most of them share one compiled program."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Suite:
+    """M tasks to evaluate on.
+
+    Attributes:
+        name: what results are reported under.
+        formulas: SPECTRL of each task.
+        trees: the tasks, numpy leaves with leading axis M.
+    """
+
+    name: str
+    formulas: tuple[str, ...]
+    trees: TaskTree
+
+    def __len__(self) -> int:
+        """M."""
+        return len(self.formulas)
+
+    @property
+    def depths(self) -> np.ndarray:
+        """Edges on each task's longest path, int ``[M]``."""
+        return np.asarray(self.trees.depth).max(-1)
+
+    @property
+    def hashes(self) -> np.ndarray:
+        """``task_hash`` of each task, uint32 ``[M]``."""
+        return task_hashes(self.trees)
+
+    def take(self, rows: Sequence[int] | np.ndarray) -> Suite:
+        """Some of the tasks, under the same name and with the same N."""
+        rows = np.asarray(rows)
+        trees: TaskTree = jax.tree.map(lambda x: x[rows], self.trees)
+        return Suite(self.name, tuple(self.formulas[row] for row in rows), trees)
+
+
+def suite_from_text(name: str, text: str, propositions: Sequence[str], *, max_nodes: int = MAX_NODES) -> Suite:
+    """Reads a suite: one formula a line; ``#`` begins a comment, blank lines are skipped.
+
+    Args:
+        name: of the suite.
+        text: the lines.
+        propositions: names of the P propositions.
+        max_nodes: tasks with larger trees are refused.
+
+    Raises:
+        SpecError: with the line and column in ``text`` of the first mistake, or if there is no formula.
+    """
+    formulas, trees = [], []
+    for number, line in enumerate(text.splitlines(), 1):
+        formula = line.split("#", 1)[0].strip()
+        if not formula:
+            continue
+        try:
+            trees.append(compile_formula(parse(formula), propositions, max_nodes))
+        except SpecError as error:
+            column = None if error.column is None else error.column + line.index(formula)
+            raise SpecError(error.message, number, column or 1) from None
+        formulas.append(formula)
+    if not formulas:
+        raise SpecError(f"{name}: found no formula, expected one on each line")
+    return Suite(name, tuple(formulas), _stack(trees))
+
+
+def suite_from_trees(name: str, trees: TaskTree, propositions: Sequence[str]) -> Suite:
+    """A suite of given trees (leading axis M), such as a sampler's."""
+    trees = jax.tree.map(np.asarray, trees)
+    each = [jax.tree.map(lambda x, i=i: x[i], trees) for i in range(trees.parent.shape[0])]
+    return Suite(name, tuple(tree_to_text(tree, propositions) for tree in each), _stack(each))
+
+
+def _stack(trees: Sequence[TaskTree]) -> TaskTree:
+    """One stack with the smallest N that holds them all, rounded up."""
+    numpy_trees = [jax.tree.map(np.asarray, tree) for tree in trees]
+    # Parents come before their children and padding last, so nodes beyond the last valid one can go.
+    needed = max(int(np.flatnonzero(tree.valid).max()) + 1 for tree in numpy_trees)
+    size = -(-needed // NODES_MULTIPLE) * NODES_MULTIPLE
+    stacked: TaskTree = jax.tree.map(lambda *leaves: np.stack(leaves), *[_resize(tree, size) for tree in numpy_trees])
+    return stacked
+
+
+def _resize(tree: TaskTree, size: int) -> TaskTree:
+    """The same task with N = ``size``, cutting or adding padding."""
+
+    def fit(leaf: np.ndarray, fill: Any) -> np.ndarray:
+        fitted = np.full((size, *leaf.shape[1:]), fill, leaf.dtype)
+        rows = min(size, len(leaf))
+        fitted[:rows] = leaf[:rows]
+        return fitted
+
+    leaves: dict[str, Any] = {name: fit(getattr(tree, name), 0) for name in ("reach", "avoid", "depth")}
+    leaves |= {name: fit(getattr(tree, name), False) for name in ("accepting", "valid")}
+    return TaskTree(parent=fit(np.asarray(tree.parent), TaskTree.NO_NODE), **leaves)  # type: ignore[arg-type]
