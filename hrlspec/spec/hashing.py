@@ -19,8 +19,9 @@ from hrlspec.spec.tree import TaskTree
 _REACH, _AVOID, _ACCEPTING, _LEAF = 0x9E3779B9, 0x7F4A7C15, 0xC2B2AE35, 0x27D4EB2F
 
 
+@jax.jit
 def task_hash(tree: TaskTree) -> jax.Array:
-    """Hash of one task, uint32 ``[]``; ``jit`` and ``vmap`` it.
+    """Hash of one task, uint32 ``[]``; ``vmap`` for more.
 
     It depends on the reach and avoid sets of the edges, on which nodes accept and on how the edges follow
     each other; not on the order of the nodes, on padding, or on where padding stands.
