@@ -1,0 +1,99 @@
+"""The examples of docs/semantics.md and docs/language.md."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import jax.numpy as jnp
+import pytest
+
+from hrlspec.spec import (
+    RUNNING,
+    SATISFIED,
+    VIOLATED,
+    SpecError,
+    TaskTree,
+    advance,
+    compile,
+    compiler,
+    conditions,
+    graph,
+    initial,
+    parse,
+    satisfies,
+    syntax,
+    task_hash,
+)
+from tests.spec.tasks import NAMES
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def _blocks(page: str, kind: str) -> list[list[str]]:
+    text = (DOCS / page).read_text(encoding="utf-8")
+    return [block.strip().splitlines() for block in re.findall(rf"^```{kind}\n(.*?)^```$", text, re.M | re.S)]
+
+
+def _rows(kind: str) -> list[tuple[str, str]]:
+    rows = [line.split("|") for block in _blocks("language.md", kind) for line in block]
+    return [(left.strip(), right.strip()) for left, right in rows]
+
+
+EXAMPLES = _blocks("semantics.md", "spectrl")
+
+
+def _monitor(text: str, trace: list[set[str]]) -> str:
+    try:
+        tree = compile(parse(text), NAMES, 16)
+    except SpecError:
+        return "refused"
+    state = initial(tree)
+    for now in trace:
+        state = advance(tree, state, jnp.array([name in now for name in NAMES]), TaskTree.NO_NODE)
+    return {RUNNING: "running", SATISFIED: "satisfied", VIOLATED: "violated"}[int(state.status)]
+
+
+@pytest.mark.filterwarnings("ignore::hrlspec.spec.SpecWarning")
+@pytest.mark.parametrize("lines", EXAMPLES, ids=" | ".join)
+def test_example_means_what_the_page_says(lines: list[str]) -> None:
+    text, second = lines
+    steps, verdicts = second.split("->")
+    monitor, exact = (word.strip() for word in verdicts.split(","))
+    trace = [set(re.findall(r"\w+", step)) for step in re.findall(r"\{(.*?)\}", steps)]
+    assert _monitor(text, trace) == monitor
+    assert satisfies(parse(text), trace) == {"true": True, "false": False}[exact]
+
+
+def test_every_kind_of_example_is_there() -> None:
+    verdicts = {lines[1].split("->")[1].strip() for lines in EXAMPLES}
+    assert {"violated, true", "running, true", "violated, false", "satisfied, true", "running, false"} <= verdicts
+    assert len(EXAMPLES) >= 20
+
+
+@pytest.mark.filterwarnings("ignore::hrlspec.spec.SpecWarning")
+@pytest.mark.parametrize(("text", "same"), _rows("equal"))
+def test_equal_tasks(text: str, same: str) -> None:
+    assert int(task_hash(compile(parse(text), NAMES, 16))) == int(task_hash(compile(parse(same), NAMES, 16)))
+
+
+@pytest.mark.parametrize(("text", "reason"), _rows("refused"))
+def test_refused_tasks(text: str, reason: str) -> None:
+    with pytest.raises(SpecError) as caught:
+        compile(parse(text), NAMES, 16)
+    assert str(caught.value).startswith(reason)
+
+
+def test_limits_are_as_written() -> None:
+    page = (DOCS / "language.md").read_text(encoding="utf-8").partition("## Limits")[2]
+    table = re.findall(r"^\| .*\| \D*(\d[\d,]*)[^|]*\|$", page, re.M)
+    expected = [
+        syntax.MAX_TEXT,
+        syntax.MAX_NESTING,
+        syntax.MAX_TERMS,
+        conditions.MAX_ALTERNATIVES,
+        graph.MAX_STEPS,
+        syntax.MAX_WORK,
+        compiler.MAX_NODES,
+    ]
+    assert [int(number.replace(",", "")) for number in table] == expected
