@@ -27,7 +27,8 @@ def normalise(advantage: jax.Array, mask: jax.Array) -> jax.Array:
 
 def policy_loss(log_prob: jax.Array, old: jax.Array, advantage: jax.Array, mask: jax.Array, clip: float) -> jax.Array:
     """Clipped surrogate; ``old`` is the log-probability at the start of the update, under the same task."""
-    ratio = jnp.exp(jnp.where(mask, log_prob - old, 0.0))
+    # Far outside the clip range only the sign matters; the bound keeps exp from overflowing.
+    ratio = jnp.exp(jnp.clip(jnp.where(mask, log_prob - old, 0.0), -10.0, 10.0))
     surrogate = jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - clip, 1 + clip) * advantage)
     return -masked_mean(surrogate, mask)
 
@@ -57,7 +58,7 @@ def gradient_step(
 ) -> tuple[Any, optax.OptState, dict[str, jax.Array]]:
     """One step; a non-finite loss or gradient leaves everything as it was and is counted in ``skipped``."""
     (value, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(params)
-    norm = optax.global_norm(gradient)
+    norm = optax.tree.norm(gradient)
     finite = jnp.isfinite(norm) & jnp.isfinite(value)
     updates, new_state = transform.update(gradient, optimiser_state, params)
     stepped = jax.tree.map(lambda p, u: p - learning_rate * u, params, updates)
