@@ -221,6 +221,24 @@ def read_metrics(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
     return _read_rows(Path(path))[0]
 
 
+def read_summary(path: str | os.PathLike[str]) -> dict[str, Any] | None:
+    """``summary.json`` of a run, ``None`` while the run is not finished.
+
+    Raises:
+        UserError: it is damaged.
+    """
+    file = Path(path) / "summary.json"
+    try:
+        summary = json.loads(file.read_text())
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise UserError(f"cannot read {file}: {error}; without it --resume writes it anew") from error
+    if not isinstance(summary, dict):
+        raise UserError(f"{file} is not a summary; without it --resume writes it anew")
+    return summary
+
+
 def config_hash(config: Mapping[str, Any]) -> str:
     """SHA-256 of a configuration, the same for every order of its entries."""
     return hashlib.sha256(json.dumps(_plain(config), sort_keys=True).encode()).hexdigest()

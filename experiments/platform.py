@@ -1,0 +1,49 @@
+"""What XLA and JAX are told before their first use. Call `prepare` at the start of a command line.
+
+XLA reads its flags when the first array is made, so this must come before that; importing JAX is harmless.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+from pathlib import Path
+
+import jax
+
+_OPTIONS = "--xla_backend_extra_options="
+# The CPU backend folds the body of a small loop into one kernel, which makes rollouts several times faster. Up to JAX
+# 0.11 what it calls small is too small for them; from 0.12 on its own choice is better.
+_SMALL_LOOPS = "xla_cpu_small_while_loop_byte_threshold"
+_SMALL_LOOPS_BYTES = 65536
+
+
+def prepare() -> None:
+    """Sets XLA's flags for this version of JAX and a compilation cache that later processes share.
+
+    What the user set in ``XLA_FLAGS``, ``JAX_COMPILATION_CACHE_DIR`` and JAX's other variables stays as it is.
+    """
+    os.environ["XLA_FLAGS"] = with_loop_option(os.environ.get("XLA_FLAGS", ""), jax.__version_info__)
+    if jax.config.values["jax_compilation_cache_dir"] is None:
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
+    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def with_loop_option(flags: str, version: tuple[int, ...]) -> str:
+    """``XLA_FLAGS`` with the option for small loops, where this version of JAX wants it and it is not there yet."""
+    if version >= (0, 12) or _SMALL_LOOPS in flags:
+        return flags
+    option = f"{_SMALL_LOOPS}={_SMALL_LOOPS_BYTES}"
+    words = flags.split()
+    for i, word in enumerate(words):
+        if word.startswith(_OPTIONS):  # a second flag of this name would replace the first
+            words[i] = f"{word},{option}"
+            return " ".join(words)
+    return " ".join([*words, _OPTIONS + option])
+
+
+def cache_folder() -> Path:
+    """The user's folder for compiled programs, one for each version of jaxlib."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "hrlspec" / f"jaxlib-{importlib.metadata.version('jaxlib')}"
