@@ -16,11 +16,10 @@ import numpy as np
 from flax import struct
 
 from envs_jax.base import Box, Discrete, Environment, EnvParams, StepResult
+from hrlspec.agent import Agent
 from hrlspec.config import Config, CurriculumConfig, NetworkConfig, PPOConfig, RelabelConfig, ShieldConfig
 from hrlspec.spec.tree import TaskTree
 from tests.tasks import tree_of
-
-ACHIEVE_A = (0, "a", "")
 
 
 def probe_task(name: str, *, num_propositions: int, num_nodes: int) -> TaskTree:
@@ -158,6 +157,18 @@ def small_config(**changes: Any) -> Config:
     return dataclasses.replace(config, **changes)
 
 
+def random_params(agent: Agent, seed: int) -> Any:
+    """Parameters of the right shapes, biases included, without compiling the initialisers."""
+    rng = np.random.default_rng(seed)
+    shapes = jax.eval_shape(agent.init, jax.random.key(0))
+    return jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape) / np.sqrt(max(x.shape[0], 4)), x.dtype), shapes)
+
+
+def on_device(tree: Any) -> Any:
+    """A pytree's arrays as JAX arrays."""
+    return jax.tree.map(jnp.asarray, tree)
+
+
 def pairs(flags: Any) -> set[int]:
     """The indices of the propositions that are true."""
     return set(np.flatnonzero(np.asarray(flags)).tolist())
@@ -197,7 +208,6 @@ def random_order(rng: np.random.Generator, tree: TaskTree) -> np.ndarray:
 
 def subtree(tree: TaskTree, node: int, num_nodes: int) -> tuple[TaskTree, list[int]]:
     """The progression at a node as a tree of its own, and which of the original rows became its rows."""
-    tree = jax.tree.map(np.asarray, tree)
     rows = [node]
     for k in range(tree.num_nodes):
         if tree.valid[k] and tree.parent[k] in rows:
