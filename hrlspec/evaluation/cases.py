@@ -12,7 +12,6 @@ import functools
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from hrlspec import solver
@@ -25,6 +24,10 @@ from hrlspec.yardsticks import branch_scores, myopic_steps
 LAYOUTS_PER_TASK = 10
 MOST_ROUNDS = 20
 """Draws of ``layouts_per_task`` layouts for a task before it is taken to be impossible (or nearly)."""
+
+
+BLOCK = 512
+"""Layouts drawn at a time, so that one compiled program serves all suites."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -216,19 +219,23 @@ def task_of(suite: Suite, row: int) -> TaskTree:
 
 def draw_layouts(env: Any, suite: Suite, layouts_per_task: int, *, seed: int = 0, draw: int = 0) -> Any:
     """Layouts for each task in turn, numpy leaves with leading axis M · ``layouts_per_task``."""
-    count = np.arange(draw * layouts_per_task, (draw + 1) * layouts_per_task)
-    layouts = _layouts(env, jax.random.key(seed), suite.hashes, count.astype(np.uint32))
-    return jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[2:]), layouts)
+    count = np.arange(draw * layouts_per_task, (draw + 1) * layouts_per_task, dtype=np.uint32)
+    hashes, counts = np.repeat(suite.hashes, layouts_per_task), np.tile(count, len(suite))
+    key, parts = jax.random.key(seed), []
+    for first in range(0, len(hashes), BLOCK):
+        rows = np.arange(first, first + BLOCK) % len(hashes)  # The last block is filled up by wrapping around.
+        parts.append(jax.tree.map(np.asarray, _layouts(env, key, hashes[rows], counts[rows])))
+    return jax.tree.map(lambda *x: np.concatenate(x)[: len(hashes)], *parts)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _layouts(env: Any, key: jax.Array, hashes: jax.Array, count: jax.Array) -> Any:
-    """Leading axes M and ``layouts_per_task``."""
+def _layouts(env: Any, key: jax.Array, hashes: jax.Array, counts: jax.Array) -> Any:
+    """A layout for each pair of a task's hash and a number, leading axis ``BLOCK``."""
 
     def one(task: jax.Array, number: jax.Array) -> Any:
         return env.sample_layout(jax.random.fold_in(jax.random.fold_in(key, task), number), env.default_params)
 
-    return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(jnp.asarray(hashes), count)
+    return jax.vmap(one)(hashes, counts)
 
 
 def _solve(graph: Graph | None, suite: Suite, row: int, layouts_per_task: int) -> tuple[np.ndarray, np.ndarray]:

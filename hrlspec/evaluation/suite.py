@@ -12,11 +12,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from hrlspec.spec import TaskTree, task_hashes
-from hrlspec.spec.compiler import compile as compile_formula
-from hrlspec.spec.parser import parse
-from hrlspec.spec.syntax import SpecError
-from hrlspec.spec.text import tree_to_text
+from hrlspec import spec
+from hrlspec.spec import SpecError, TaskTree, parse, task_hashes, tree_to_text
 
 MAX_NODES = 256
 """Largest tree that a suite may hold unless told otherwise."""
@@ -78,7 +75,7 @@ def suite_from_text(name: str, text: str, propositions: Sequence[str], *, max_no
         if not formula:
             continue
         try:
-            trees.append(compile_formula(parse(formula), propositions, max_nodes))
+            trees.append(spec.compile(parse(formula), propositions, max_nodes))
         except SpecError as error:
             column = None if error.column is None else error.column + line.index(formula)
             raise SpecError(error.message, number, column or 1) from None

@@ -1,0 +1,75 @@
+"""Agents written by hand, for Letter: what they score is known without running the library's yardsticks."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs_jax.letter import MOVES
+from hrlspec.agent import Agent, Params, View
+from hrlspec.spec import TaskState, TaskTree, open_edges
+
+FAR = 1e4
+
+
+def manner(*, look_ahead: bool = False, last: bool = False) -> Params:
+    """How a :class:`Walker` acts.
+
+    Args:
+        look_ahead: count the way from each goal to the next sub-task's nearest one too (for sequences, where nothing
+            is avoided after the first sub-task); else the nearest goal is the best.
+        last: the planner takes the edge into the last open node, else that into the first.
+    """
+    return {"look_ahead": jnp.bool_(look_ahead), "last": jnp.bool_(last)}
+
+
+class Walker(Agent):
+    """Walks a shortest path to what its sub-task reaches, clear of what it avoids. Act greedily.
+
+    Its parameters, which change how it acts without compiling anything anew, come from :func:`manner`.
+    """
+
+    def embed_task(self, params: Params, tree: TaskTree) -> jax.Array:
+        """What the node's first child reaches, float32 ``[N, P]``."""
+        del params
+        child = tree.parent[None, :] == jnp.arange(tree.num_nodes)[:, None]
+        return jnp.where(child.any(-1)[:, None], tree.reach[child.argmax(-1)], False).astype(jnp.float32)
+
+    def plan(
+        self, params: Params, view: View, tree: TaskTree, state: TaskState, avoid: jax.Array, future: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """By index."""
+        del view, avoid, future
+        index = jnp.arange(tree.num_nodes)
+        wish = jnp.where(params["last"], index, -index)
+        return jnp.where(open_edges(tree, state), wish.astype(jnp.float32), -FAR), jnp.float32(0)
+
+    def control(
+        self, params: Params, view: View, reach: jax.Array, avoid: jax.Array, future: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Minus the steps that remain after each action."""
+        planes = view[0] > 0  # bool [P, n, n], the agent in the middle cell
+
+        def holds(wanted: jax.Array) -> jax.Array:
+            return (planes & (wanted > 0)[:, None, None]).any(0)
+
+        after = _distance(jnp.where(holds(future), 0.0, FAR), jnp.zeros(planes.shape[1:], bool))
+        counts = params["look_ahead"] & (future > 0).any()
+        ahead = _distance(jnp.where(holds(reach), jnp.where(counts, after, 0.0), FAR), holds(avoid))
+        middle = planes.shape[-1] // 2
+        rows, columns = (middle + np.array(MOVES)).T % planes.shape[-1]
+        return -ahead[rows, columns], jnp.float32(0)
+
+
+def _distance(cost: jax.Array, closed: jax.Array) -> jax.Array:
+    """Least cost of ending up in a cell after walking there, float32 ``[n, n]``."""
+
+    def round_(_: Any, best: jax.Array) -> jax.Array:
+        around = [jnp.roll(best, shift, axis) for shift in (1, -1) for axis in (0, 1)]
+        onward = jnp.minimum(jnp.minimum(around[0], around[1]), jnp.minimum(around[2], around[3])) + 1
+        return jnp.where(closed, FAR, jnp.minimum(cost, onward))
+
+    return jax.lax.fori_loop(0, cost.size, round_, jnp.where(closed, FAR, cost))
