@@ -16,10 +16,10 @@ from flax import struct
 
 from envs_jax import Environment
 from hrlspec.config import Config
-from hrlspec.networks.controller import Controller
+from hrlspec.networks.controller import Controller, Instruction
 from hrlspec.networks.planner import Planner
 from hrlspec.networks.reach_critic import ReachCritic
-from hrlspec.spec import TaskState, TaskTree, initial, subtask_avoid
+from hrlspec.spec import TaskState, TaskTree, initial
 
 View = tuple[jax.Array, jax.Array]
 Params = dict[str, Any]
@@ -27,17 +27,15 @@ Params = dict[str, Any]
 
 @struct.dataclass
 class TaskBook:
-    """M tasks, and what the low level needs of them, computed once per task and parameters.
+    """M tasks, and what the low level is told of them, computed once per task and parameters.
 
     Attributes:
         tree: the tasks, leading axis M.
-        avoid: bool ``[M, N, P]``, p₋ of the sub-task of each edge (eq. 2).
-        future: float32 ``[M, N, F]``, embedding of what remains once each node is reached.
+        told: the instruction for each edge, leading axes ``[M, N]``.
     """
 
     tree: TaskTree
-    avoid: jax.Array  # bool [M, N, P]
-    future: jax.Array  # float32 [M, N, F]
+    told: Instruction
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +58,7 @@ class Agent:
     @functools.cached_property
     def controller(self) -> Controller:
         """The low level."""
-        return Controller(self.config.network, self.env.action_space.n, self.env.num_propositions)
+        return Controller(self.config.network, self.env.action_space.n)
 
     @functools.cached_property
     def reach_critic(self) -> ReachCritic:
@@ -79,35 +77,33 @@ class Agent:
             "reach_critic": self.reach_critic.init(keys[2], view),
         }
 
-    def embed_task(self, params: Params, tree: TaskTree) -> jax.Array:
-        """Embedding of what remains after each node of one task, float32 ``[N, F]``; zeros for Myopic-low."""
+    def instruct(self, params: Params, tree: TaskTree) -> Instruction:
+        """What the low level is told for every edge of one task, leading axis N; nothing of the future for Myopic-low."""
+        told = self.controller.apply(params["controller"], tree, method="instruct")
         if not self.config.future_embedding:
-            return jnp.zeros((tree.num_nodes, self.config.network.task_features))
-        return self.controller.apply(params["controller"], tree, method="embed")
+            told = told.replace(ahead=jnp.zeros_like(told.ahead), future=jnp.zeros_like(told.future))
+        return told
 
     def open_book(self, params: Params, trees: TaskTree) -> TaskBook:
         """Prepares tasks (leading axis M) for acting."""
-        return TaskBook(
-            tree=trees,
-            avoid=jax.vmap(subtask_avoid)(trees),
-            future=jax.vmap(self.embed_task, in_axes=(None, 0))(params, trees),
-        )
+        return TaskBook(tree=trees, told=jax.vmap(self.instruct, in_axes=(None, 0))(params, trees))
 
     def plan(
-        self, params: Params, view: View, tree: TaskTree, state: TaskState, avoid: jax.Array, future: jax.Array
+        self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
     ) -> tuple[jax.Array, jax.Array]:
         """The planner on one environment: logits over edges ``[N]`` and the value of the remaining task ``[]``."""
         advice = jnp.zeros(tree.num_nodes)
         if self.config.network.advice:
-            values = jax.vmap(lambda r, a, f: self.control(params, view, r, a, f)[1])(tree.reach, avoid, future)
-            advice = jax.lax.stop_gradient(values)
+            advice = self.advise(params, view, told)
         return self.planner.apply(params["planner"], view, tree, state, advice)
 
-    def control(
-        self, params: Params, view: View, reach: jax.Array, avoid: jax.Array, future: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+    def advise(self, params: Params, view: View, told: Instruction) -> jax.Array:
+        """The low level's value of every edge's sub-task, ``[N]``."""
+        return jax.vmap(self.control, in_axes=(None, None, 0))(params, view, told)[1]
+
+    def control(self, params: Params, view: View, told: Instruction) -> tuple[jax.Array, jax.Array]:
         """The low level on one environment: action logits ``[A]`` and value ``[]``."""
-        return self.controller.apply(params["controller"], view, reach, avoid, future)
+        return self.controller.apply(params["controller"], view, told)
 
     def reach_values(self, params: Params, view: View) -> jax.Array:
         """Q(s, g, a) of reaching each proposition, float32 ``[P, A]``."""

@@ -182,15 +182,15 @@ def _copies(
     row = (jnp.arange(copies)[:, None] * num_slots + slot).reshape(-1)
     edge = new.assigned.reshape(-1)
     view = jax.tree.map(lambda x: x.reshape((copies * num_steps, *x.shape[2:])), rollout.view)
-    conditions = fresh.tree.reach[row, edge], fresh.avoid[row, edge], fresh.future[row, edge]
-    logits, value = jax.vmap(agent.control, in_axes=(None, 0, 0, 0, 0))(params, view, *conditions)
+    told = jax.tree.map(lambda x: x[row, edge], fresh.told)
+    logits, value = jax.vmap(agent.control, in_axes=(None, 0, 0))(params, view, told)
     log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), rollout.action.reshape(-1, 1), 1)[:, 0]
 
     def plan(inputs: tuple[View, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         view, row, node, edge = inputs
-        tree, avoid, future = jax.tree.map(lambda x: x[row], (fresh.tree, fresh.avoid, fresh.future))
+        tree, told = jax.tree.map(lambda x: x[row], (fresh.tree, fresh.told))
         state = jax.vmap(initial)(tree).replace(node=node)
-        logits, value = jax.vmap(agent.plan, in_axes=(None, 0, 0, 0, 0, 0))(params, view, tree, state, avoid, future)
+        logits, value = jax.vmap(agent.plan, in_axes=(None, 0, 0, 0, 0))(params, view, tree, state, told)
         return jnp.take_along_axis(jax.nn.log_softmax(logits), edge[:, None], 1)[:, 0], value
 
     decided = new.decided.reshape(-1)

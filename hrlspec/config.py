@@ -23,7 +23,9 @@ class NetworkConfig:
     planner_features: int = 64
     """F, node features of the planner's GNN."""
     planner_hidden: int = 128
-    """Hidden units of the planner's transition model, policy and critic."""
+    """Hidden units of the planner's transition model and critic."""
+    planner_policy: tuple[int, ...] = (128, 128, 128)
+    """Hidden units of the planner's policy, which is applied to every edge."""
     planner_rounds: int = 8
     """Rounds of message passing of the planner; look-ahead ends at this depth. 0: one sweep from the leaves to the root,
     which looks ahead without limit and costs an eighth."""
@@ -35,9 +37,11 @@ class NetworkConfig:
     critic: tuple[int, ...] = (64, 64)
     reach_critic: tuple[int, ...] = (64, 64)
     """Hidden units of the critic behind the shield."""
-    spotlights: int = 0
-    """Task-conditioned encoding: the low level sees the observation through p₊, p₋ and this many mixtures of propositions
-    computed from the embedding of the remaining task. 0 encodes the observation without the task, as in the paper."""
+    roles: bool = False
+    """Task-conditioned encoding: the low level sees the observation by role (the goal p₊, the forbidden p₋, what comes 1, 2, ...
+    sub-tasks later) instead of by name. Off encodes the observation without the task, as in the paper."""
+    lookahead: int = 2
+    """How many later sub-tasks have a role of their own."""
     child_embeddings: bool = False
     """Whether the planner's logit of an edge also sees the embedding of the node it leads to."""
     advice: bool = False

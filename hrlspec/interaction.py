@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from hrlspec import rewards
-from hrlspec.agent import Agent, Params, TaskBook, View, in_groups, sample, shielded_action
+from hrlspec.agent import Agent, Instruction, Params, TaskBook, View, in_groups, sample, shielded_action
 from hrlspec.rewards import RewardMachine
 from hrlspec.spec import RUNNING, SATISFIED, TaskState, TaskTree, advance, initial
 
@@ -99,8 +99,8 @@ def plan_where(
 
     def decide(inputs: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
         view, task, state, noise = inputs
-        tree, avoid, future = jax.tree.map(lambda x: x[task], (book.tree, book.avoid, book.future))
-        logits, value = jax.vmap(agent.plan, in_axes=(None, 0, 0, 0, 0, 0))(params, view, tree, state, avoid, future)
+        tree, told = jax.tree.map(lambda x: x[task], (book.tree, book.told))
+        logits, value = jax.vmap(agent.plan, in_axes=(None, 0, 0, 0, 0))(params, view, tree, state, told)
         choice, log_prob = jax.vmap(sample)(logits, noise)
         return choice, log_prob, value
 
@@ -127,14 +127,14 @@ def act(
         replaced the action.
     """
 
-    def one(view: View, reach: jax.Array, avoid: jax.Array, future: jax.Array, noise: jax.Array) -> Any:
-        logits, value = agent.control(params, view, reach, avoid, future)
+    def one(view: View, told: Instruction, noise: jax.Array) -> Any:
+        logits, value = agent.control(params, view, told)
         action, log_prob = sample(logits, noise)
-        safe = shielded_action(agent, params, view, avoid, action) if shield else action
+        safe = shielded_action(agent, params, view, told.avoid > 0, action) if shield else action
         return safe, log_prob, value, safe != action
 
-    task, edge = worker.task, worker.assigned
-    return jax.vmap(one)(worker.view, book.tree.reach[task, edge], book.avoid[task, edge], book.future[task, edge], noise)
+    told = jax.tree.map(lambda x: x[worker.task, worker.assigned], book.told)
+    return jax.vmap(one)(worker.view, told, noise)
 
 
 def transition(

@@ -9,6 +9,8 @@ nodes, **P** atomic propositions.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -146,6 +148,8 @@ def _path(
 def branch_lengths(max_path: int, max_nodes: int) -> np.ndarray:
     """Longest branch at each node of the path, int ``[K]``: K - i, shortened alike until everything fits N nodes.
 
+    What room is left then goes to the first of those that were shortened, a node each.
+
     Raises:
         ValueError: if not even the path fits.
     """
@@ -153,8 +157,11 @@ def branch_lengths(max_path: int, max_nodes: int) -> np.ndarray:
     if room < 0:
         raise ValueError(f"a path of {max_path} sub-tasks needs {max_path + 1} nodes, max_nodes is {max_nodes}")
     full = max_path - np.arange(max_path)
-    cap = max((c for c in range(max_path + 1) if np.minimum(full, c).sum() <= room), default=0)
-    return np.minimum(full, cap)
+    cap = max(c for c in range(max_path + 1) if np.minimum(full, c).sum() <= room)
+    lengths = np.minimum(full, cap)
+    shortened = np.flatnonzero(lengths < full)
+    lengths[shortened[: room - lengths.sum()]] += 1
+    return lengths
 
 
 def _grow(
@@ -179,43 +186,48 @@ def _grow(
     place = np.arange(max_path)
     grows = jax.random.bernoulli(keys[0], branch, (max_path,)) & (place < length)
     limit = jnp.minimum(length - place, longest)
-    wanted = jnp.where(grows, 1 + jnp.floor(jax.random.uniform(keys[1], (max_path,)) * limit).astype(jnp.int32), 0)
-    wanted = jnp.minimum(wanted, limit)
-    lottery = jax.random.uniform(keys[2], (max_nodes, num_propositions))
-    avoid_noise = jax.random.uniform(keys[3], (max_nodes, num_propositions + 1))
+    wanted = jnp.floor(jax.random.uniform(keys[1], (max_path,)) * limit).astype(jnp.int32) + 1
+    wanted = jnp.where(grows, jnp.minimum(wanted, limit), 0)
 
-    parent = np.full(max_nodes, TaskTree.NO_NODE, np.int32)
-    depth = np.zeros(max_nodes, np.int32)
-    parent[1 : max_path + 1], depth[1 : max_path + 1] = place, place + 1
-    reach = [jnp.zeros(num_propositions, bool), *path_reach]
-    avoid = [jnp.zeros(num_propositions, bool), *path_avoid]
-    valid = [jnp.bool_(True), *(place < length)]
-    accepting = [jnp.bool_(False), *(place + 1 == length)]
-    for i in range(max_path):
-        before = path_reach[i - 1] if i else jnp.zeros(num_propositions, bool)
-        previous, exists = i, wanted[i] > 0
-        excluded = seen[i] | before | path_reach[i]
-        for j in range(longest[i]):
-            node = len(reach)
-            exists = exists & (j < wanted[i]) & ~excluded.all()
-            goal = jax.nn.one_hot(jnp.argmax(jnp.where(excluded, -1.0, lottery[node])), num_propositions) > 0
-            parent[node], depth[node] = previous, depth[previous] + 1
-            reach.append(goal & exists)
-            avoid.append(_random_avoid(avoid_noise[node], goal | before, max_avoid) & exists)
-            valid.append(exists)
-            accepting.append(exists)
-            if j:
-                accepting[previous] = accepting[previous] & ~exists
-            previous, before, excluded = node, goal, goal
-    padding = max_nodes - len(reach)
-    valid_nodes = jnp.pad(jnp.stack(valid), (0, padding))
+    rounds = max(1, *longest)  # One at least, so that there is something to gather nothing from where no branch fits.
+    lottery = jax.random.uniform(keys[2], (rounds, max_path, num_propositions))
+    before = jnp.concatenate([jnp.zeros((1, num_propositions), bool), path_reach[:-1]])
+    excluded, exists = seen | before | path_reach, jnp.ones(max_path, bool)
+    reach, alive, forbidden = [], [], []
+    for j in range(rounds):
+        exists = exists & (j < wanted) & ~excluded.all(-1)
+        choice = jnp.argmax(jnp.where(excluded, -1.0, lottery[j]), -1)
+        goal = (jnp.arange(num_propositions) == choice[:, None]) & exists[:, None]
+        reach.append(goal)
+        alive.append(exists)
+        forbidden.append(goal | before)
+        excluded = before = goal
+    # The branches, place by place along the path, as rows after the path's own.
+    owner = np.repeat(place, longest)
+    offset = np.concatenate([np.arange(n) for n in longest])
+    goal, exists, taboo = (jnp.stack(x)[offset, owner] for x in (reach, alive, forbidden))
+    ends = exists & ~jnp.append(exists & (offset > 0), False)[1:]
+    noise = jax.random.uniform(keys[3], (len(owner), num_propositions + 1))
+    avoid = jax.vmap(lambda n, f: _random_avoid(n, f, max_avoid))(noise, taboo) & exists[:, None]
+
+    first = max_path + 1 + np.concatenate([[0], np.cumsum(longest)])[owner]
+    parent = np.where(offset, first + offset - 1, owner)
+    padding = max_nodes - 1 - max_path - len(owner)
+    nothing = jnp.zeros((1, num_propositions), bool)
+    valid = jnp.concatenate([jnp.ones(1, bool), place < length, exists, jnp.zeros(padding, bool)])
+
+    def rows(*parts: Any) -> jax.Array:
+        x = jnp.concatenate([jnp.asarray(part) for part in parts])
+        x = jnp.pad(x, ((0, padding),) + ((0, 0),) * (x.ndim - 1))
+        return jnp.where(valid.reshape((-1,) + (1,) * (x.ndim - 1)), x, 0).astype(x.dtype)
+
     return TaskTree(
-        parent=jnp.where(valid_nodes, parent, TaskTree.NO_NODE),
-        reach=jnp.pad(jnp.stack(reach), ((0, padding), (0, 0))) & valid_nodes[:, None],
-        avoid=jnp.pad(jnp.stack(avoid), ((0, padding), (0, 0))) & valid_nodes[:, None],
-        accepting=jnp.pad(jnp.stack(accepting), (0, padding)) & valid_nodes,
-        valid=valid_nodes,
-        depth=jnp.where(valid_nodes, depth, 0),
+        parent=jnp.where(valid, rows(np.full(1, TaskTree.NO_NODE), place, parent), TaskTree.NO_NODE).astype(jnp.int32),
+        reach=rows(nothing, path_reach, goal),
+        avoid=rows(nothing, path_avoid, avoid),
+        accepting=rows(np.zeros(1, bool), place + 1 == length, ends),
+        valid=valid,
+        depth=rows(np.zeros(1), place + 1, owner + 1 + offset).astype(jnp.int32),
     )
 
 

@@ -148,9 +148,10 @@ def collect(
     inputs = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), jax.vmap(randomness)(envs))
     collector = collector.replace(started=jnp.zeros(num_envs, jnp.int32))
     collector, trajectory = jax.lax.scan(step, collector, inputs)
-    low = act(agent, params, book, collector.worker, jnp.zeros((num_envs, agent.env.action_space.n)), shield=False)[2]
-    # In the middle of a sub-task the low level's value is the one of going on with it.
-    high = jnp.where(collector.decision.made, collector.decision.value, low)
+    worker = collector.worker
+    low = act(agent, params, book, worker, jnp.zeros((num_envs, agent.env.action_space.n)), shield=False)[2]
+    noise = jnp.zeros((num_envs, num_nodes))
+    high = plan_where(agent, params, book, worker, jnp.ones(num_envs, bool), noise)[2]
     cut = trajectory.truncated[-1]
     return collector, trajectory.replace(
         bootstrap=trajectory.bootstrap.at[-1].set(jnp.where(cut, trajectory.bootstrap[-1], low)),

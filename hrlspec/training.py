@@ -23,7 +23,7 @@ from hrlspec.curriculum import Curriculum
 from hrlspec.interaction import Decision, start
 from hrlspec.rewards import RewardMachine
 from hrlspec.rollout import Collector, Trajectory, collect
-from hrlspec.spec import TaskTree, subtask_avoid
+from hrlspec.spec import TaskTree
 
 Metrics = dict[str, jax.Array]
 
@@ -208,12 +208,11 @@ def controller_loss(
 ) -> tuple[jax.Array, Metrics]:
     """PPO loss of the low level on a minibatch ``[V, T]``; steps the shield replaced count for the value alone."""
     own = {"controller": params}
-    future = jax.vmap(jax.vmap(agent.embed_task, in_axes=(None, 0)), in_axes=(None, 0))(own, batch.tree)
-    avoid = jax.vmap(jax.vmap(subtask_avoid))(batch.tree)
+    told = jax.vmap(jax.vmap(agent.instruct, in_axes=(None, 0)), in_axes=(None, 0))(own, batch.tree)
     row = jnp.arange(batch.slot.shape[0])[:, None]
-    conditions = tuple(x[row, batch.slot, batch.edge] for x in (batch.tree.reach, avoid, future))
-    view, conditions = jax.tree.map(flat, (batch.view, conditions))
-    logits, value = jax.vmap(agent.control, in_axes=(None, 0, 0, 0, 0))(own, view, *conditions)
+    told = jax.tree.map(lambda x: x[row, batch.slot, batch.edge], told)
+    view, told = jax.tree.map(flat, (batch.view, told))
+    logits, value = jax.vmap(agent.control, in_axes=(None, 0, 0))(own, view, told)
     log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), flat(batch.action)[:, None], 1)[:, 0]
     on_policy, valid = flat(batch.on_policy), flat(batch.valid)
     advantage = ppo.normalise(flat(batch.advantage), on_policy)
@@ -302,8 +301,7 @@ def _advice(agent: Agent, params: Params, batch: PlanBatch) -> jax.Array:
     """The low level's value of every edge's sub-task, ``[B, N]``, at the start of the update."""
 
     def one(view: Any, tree: TaskTree) -> jax.Array:
-        conditions = tree.reach, subtask_avoid(tree), agent.embed_task(params, tree)
-        return jax.vmap(lambda r, a, f: agent.control(params, view, r, a, f)[1])(*conditions)
+        return agent.advise(params, view, agent.instruct(params, tree))
 
     return jax.vmap(one)(batch.view, batch.tree)
 

@@ -1,6 +1,7 @@
 """The low level: a policy and value conditioned on the assigned sub-task and on what remains after it.
 
-Paper, "Low-level Module". Axes: **N** tree nodes, **P** atomic propositions, **G** channels, **F** features.
+Paper, "Low-level Module". Axes: **N** tree nodes, **P** atomic propositions, **G** channels, **D** later sub-tasks,
+**F** features.
 """
 
 from __future__ import annotations
@@ -8,11 +9,29 @@ from __future__ import annotations
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from hrlspec.config import NetworkConfig
 from hrlspec.networks.encoder import MLP, Encoder
-from hrlspec.networks.tree import TaskEmbedding
-from hrlspec.spec import TaskTree
+from hrlspec.networks.tree import TaskEmbedding, lookahead
+from hrlspec.spec import TaskTree, subtask_avoid
+
+
+@struct.dataclass
+class Instruction:
+    """What the low level is told.
+
+    Attributes:
+        reach: float32 ``[P]``, p₊ of the assigned sub-task.
+        avoid: float32 ``[P]``, p₋ (eq. 2).
+        ahead: float32 ``[D, P]``, what may be reached 1, 2, ... sub-tasks after it.
+        future: float32 ``[F]``, embedding of the task that remains after it.
+    """
+
+    reach: jax.Array
+    avoid: jax.Array
+    ahead: jax.Array
+    future: jax.Array
 
 
 class Controller(nn.Module):
@@ -20,55 +39,43 @@ class Controller(nn.Module):
 
     config: NetworkConfig
     num_actions: int
-    num_propositions: int
 
     def setup(self) -> None:
         """Declares the parts."""
         c = self.config
         self.task_embedding = TaskEmbedding(c.task_features, c.task_rounds)
-        self.spotlights = nn.Dense(c.spotlights * self.num_propositions)
         self.encoder = Encoder(c.latent, c.conv_channels, c.encoder_mlp)
         self.actor = MLP((*c.actor, self.num_actions), final_scale=0.01)
         self.critic = MLP((*c.critic, 1), tanh=True, final_scale=1.0)
 
-    def embed(self, tree: TaskTree) -> jax.Array:
-        """Embeddings of every progression of a task, float32 ``[N, F]``."""
-        return self.task_embedding(tree)
+    def instruct(self, tree: TaskTree) -> Instruction:
+        """The instruction for every edge of a task at once, leading axis N."""
+        depth = self.config.lookahead if self.config.roles else 0
+        return Instruction(
+            reach=tree.reach.astype(jnp.float32),
+            avoid=subtask_avoid(tree).astype(jnp.float32),
+            ahead=lookahead(tree, depth).astype(jnp.float32),
+            future=self.task_embedding(tree),
+        )
 
-    def channels(self, planes: jax.Array, reach: jax.Array, avoid: jax.Array, future: jax.Array) -> jax.Array:
-        """What the encoder looks at, ``[G, ...]``.
-
-        With spotlights these are mixtures of the propositions' planes: the goal's, the forbidden ones', and some
-        that the embedding of the remaining task picks. The encoder then sees roles instead of names, and
-        need not push the whole observation through its latent. Without them, one channel per proposition.
-        """
-        if not self.config.spotlights:
-            return planes
-        picked = nn.tanh(self.spotlights(future)).reshape(self.config.spotlights, self.num_propositions)
-        roles = jnp.concatenate([reach[None], avoid[None], picked])
-        return jnp.tensordot(roles, planes, axes=1)
-
-    def __call__(
-        self, view: tuple[jax.Array, jax.Array], reach: jax.Array, avoid: jax.Array, future: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+    def __call__(self, view: tuple[jax.Array, jax.Array], told: Instruction) -> tuple[jax.Array, jax.Array]:
         """Acts on one sub-task.
 
         Args:
             view: the observation, as ``env.proposition_view`` gives it.
-            reach: p₊, ``[P]``.
-            avoid: p₋, ``[P]``.
-            future: embedding of the task that remains after the sub-task, ``[F]``.
+            told: the assigned sub-task and what follows.
 
         Returns:
             Logits over actions ``[A]`` and the value ``[]``.
         """
         planes, shared = view
-        reach, avoid = reach.astype(jnp.float32), avoid.astype(jnp.float32)
-        latent = nn.relu(self.encoder(self.channels(planes, reach, avoid, future), shared))
-        x = jnp.concatenate([latent, reach, avoid, future])
+        if self.config.roles:
+            # By role the encoder need not push the whole observation through its latent to find the goal afterwards.
+            planes = jnp.tensordot(jnp.concatenate([told.reach[None], told.avoid[None], told.ahead]), planes, axes=1)
+        latent = nn.relu(self.encoder(planes, shared))
+        x = jnp.concatenate([latent, told.reach, told.avoid, told.future])
         return self.actor(x), self.critic(x)[0]
 
     def everything(self, view: tuple[jax.Array, jax.Array], tree: TaskTree) -> tuple[jax.Array, jax.Array]:
         """Touches every parameter, for initialisation."""
-        embeddings = self.embed(tree)
-        return self(view, tree.reach[0], tree.avoid[0], embeddings[0])
+        return self(view, jax.tree.map(lambda x: x[0], self.instruct(tree)))

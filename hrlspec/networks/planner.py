@@ -31,8 +31,7 @@ class Planner(nn.Module):
         self.project = nn.Dense(features)
         self.message = MLP((features, features))
         self.update = MLP((features, features))
-        self.policy = MLP((c.planner_hidden,) * 3, final_activation=True)
-        self.logit = nn.Dense(c.planner_hidden, kernel_init=nn.initializers.normal(0.01))
+        self.policy = MLP((*c.planner_policy, 1), final_scale=0.01)
         self.value = MLP((c.planner_hidden, c.planner_hidden, 1), tanh=True, final_scale=1.0)
 
     def encode(self, view: tuple[jax.Array, jax.Array]) -> jax.Array:
@@ -100,11 +99,11 @@ class Planner(nn.Module):
         feasible = open_edges(tree, state)
         best = jnp.where(feasible, advice, -jnp.inf).max(initial=-1e3)
         best = jnp.where(feasible.any(), best, 0.0)
-        inputs = [tree.reach, subtask_avoid(tree)]
+        inputs = [jnp.broadcast_to(root, embeddings.shape), tree.reach, subtask_avoid(tree)]
         if self.config.child_embeddings:
             inputs.append(embeddings)
         if self.config.advice:
             inputs.append((advice - best)[:, None] * feasible[:, None])
-        logits = self.logit(jnp.concatenate([x.astype(jnp.float32) for x in inputs], -1)) @ self.policy(root)
+        logits = self.policy(jnp.concatenate([x.astype(jnp.float32) for x in inputs], -1))[:, 0]
         value = self.value(jnp.append(root, best) if self.config.advice else root)[0]
         return jnp.where(feasible, logits, MASKED), value

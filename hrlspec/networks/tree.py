@@ -39,6 +39,16 @@ def sweep_up(visit: Callable[..., Any], module: nn.Module, carry: Any) -> jax.Ar
     return scan(module, carry, jnp.arange(num_nodes))[1]
 
 
+def lookahead(tree: TaskTree, depth: int) -> jax.Array:
+    """What may be reached 1, 2, ... sub-tasks after each node, over all branches, bool ``[N, depth, P]``."""
+    ahead = []
+    reach = tree.reach.astype(jnp.float32)
+    for _ in range(depth):
+        reach = sum_to_parents(reach, tree.parent, tree.valid & (tree.parent >= 0))
+        ahead.append(reach > 0)
+    return jnp.stack(ahead, 1) if ahead else jnp.zeros((tree.num_nodes, 0, tree.num_propositions), bool)
+
+
 class TaskEmbedding(nn.Module):
     """GCN over a task tree with zero node features and only p₊ on the edges (paper, "DAG Processing").
 
