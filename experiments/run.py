@@ -62,10 +62,9 @@ def _check_folders(runs: Sequence[tuple[Experiment, Path]], flags: RunFlags) -> 
     if not any(begun):
         raise UserError(f"there is no run to resume in {runs[0][1]}")
     for (experiment, folder), exists in zip(runs, begun, strict=True):
-        if exists and read_summary(folder) is not None:
-            there = experiment_of(read_record(folder)["config"], str(folder))
-            if there != experiment:
-                raise UserError(f"{folder} holds a finished run with other settings; choose another --out")
+        record = read_record(folder) if exists else {}
+        if exists and read_summary(folder) is not None and experiment_of(record["config"], str(folder)) != experiment:
+            raise UserError(f"{folder} holds a finished run with other settings; choose another --out")
     return begun
 
 

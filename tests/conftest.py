@@ -1,0 +1,12 @@
+"""What all tests share."""
+
+from __future__ import annotations
+
+import os
+
+import jax
+
+from experiments.platform import with_loop_option
+
+# Before the first array is made, so that tests and the processes they start run the same programs, to the bit.
+os.environ["XLA_FLAGS"] = with_loop_option(os.environ.get("XLA_FLAGS", ""), jax.__version_info__)
