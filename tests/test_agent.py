@@ -99,19 +99,23 @@ def trees() -> TaskTree:
 def test_the_book_holds_each_sub_tasks_avoid_set(agent: Agent, trees: TaskTree) -> None:
     params = random_params(agent, 0)
     book = jax.jit(agent.open_book)(params, trees)
-    embed = jax.jit(agent.embed_task)
+    instruct = jax.jit(agent.instruct)
     for m in range(20):
         tree = jax.tree.map(lambda x, m=m: x[m], trees)
-        np.testing.assert_allclose(book.future[m], embed(params, tree), atol=1e-6)
+        alone = instruct(params, tree)
+        jax.tree.map(lambda x, y, m=m: np.testing.assert_allclose(x[m], y, atol=1e-6), book.told, alone)
+        np.testing.assert_array_equal(book.told.reach[m], tree.reach)
         for k in range(6):
             siblings = [j for j in range(6) if tree.valid[j] and tree.parent[j] == tree.parent[k] >= 0 and j != k]
             reached = set().union(*(pairs(tree.reach[j]) for j in siblings))
             expected = pairs(tree.avoid[k]) | (reached - pairs(tree.reach[k])) if tree.valid[k] else set()
-            assert pairs(book.avoid[m, k]) == expected
+            assert pairs(book.told.avoid[m, k]) == expected
 
 
 def test_myopic_low_sees_nothing_of_the_future(trees: TaskTree) -> None:
-    agent = Agent(Corridor(), small_config(future_embedding=False))
+    agent, sighted = Agent(Corridor(), small_config(future_embedding=False)), Agent(Corridor(), small_config())
     params = random_params(agent, 0)
-    assert not np.asarray(agent.open_book(params, trees).future).any()
-    assert np.asarray(Agent(Corridor(), small_config()).embed_task(params, jax.tree.map(lambda x: x[0], trees))).any()
+    for name, told in (("myopic", agent.open_book(params, trees).told), ("ours", sighted.open_book(params, trees).told)):
+        assert np.asarray(told.reach).any() and np.asarray(told.avoid).any()
+        for future in (told.future, told.ahead):
+            assert np.asarray(future).any() == (name == "ours")
