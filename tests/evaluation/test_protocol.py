@@ -126,7 +126,8 @@ def test_an_untrained_agent_and_nothing_compiled_twice():
     suite = _sequences(3, 15, 1)
     periodic = periodic_evaluation(LETTER, suite, episodes=20)
     before = episodes._run._cache_size()
-    results = [periodic(KEY, agent, agent.init(jax.random.key(seed)), COMPLETION) for seed in (0, 1)]
+    init = jax.jit(agent.init)
+    results = [periodic(KEY, agent, init(jax.random.key(seed)), COMPLETION) for seed in (0, 1)]
     assert episodes._run._cache_size() == before + 1
     for result in results:
         assert result.total.episodes == 20
@@ -135,7 +136,7 @@ def test_an_untrained_agent_and_nothing_compiled_twice():
             f"eval/{name}" for name in ("return_mean", "success_rate", "steps_mean", "spl")
         }
         assert json.loads(json.dumps(result.to_json(), allow_nan=False))["actions"] == "sampled"
-    again = periodic(KEY, agent, agent.init(jax.random.key(0)), COMPLETION)
+    again = periodic(KEY, agent, init(jax.random.key(0)), COMPLETION)
     assert again.to_json() == results[0].to_json()
 
 
