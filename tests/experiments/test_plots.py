@@ -1,0 +1,81 @@
+"""Pictures: the files are there, of the right form, and show what happened."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from PIL import Image
+
+from experiments import plots
+from experiments.plots import Walk
+from tests.tasks import tree_of
+
+NAMES = tuple("abcde")
+
+
+@pytest.fixture
+def walk() -> Walk:
+    """Down over the edge of the torus onto a, then right to b; c is the other branch."""
+    layout = np.full((5, 5), -1)
+    layout[3, 0], layout[3, 2], layout[1, 1] = 0, 1, 2
+    cells = np.array([[0, 0], [4, 0], [3, 0], [3, 1], [3, 2]])
+    return Walk(
+        formula="(achieve a; achieve b) or achieve c",
+        tree=tree_of([(0, "a", ""), (0, "c", ""), (1, "b", "d")]),
+        layout=layout,
+        cells=cells,
+        nodes=np.array([0, 0, 1, 1, 3]),
+        assigned=np.array([1, 1, 3, 3]),
+        success=True,
+        violated=False,
+    )
+
+
+def test_a_trajectory_names_its_subtasks(walk: Walk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    labels: list[str] = []
+    circles: list[tuple[float, float]] = []
+    plot = Axes.plot
+
+    def spy(self: Axes, *args: object, **options: object) -> object:
+        if options.get("label"):
+            labels.append(str(options["label"]))
+        if options.get("markersize") == 30:
+            circles.append((float(args[0]), float(args[1])))  # type: ignore[arg-type]
+        return plot(self, *args, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Axes, "plot", spy)
+    with Image.open(plots.trajectory(walk, NAMES, tmp_path / "t.png")) as image:
+        assert image.format == "PNG"
+    assert labels == ["1. a, avoiding c", "2. b, avoiding d"]
+    assert circles == [(0, 3), (2, 3)]  # column, row of a and of b
+
+
+def test_a_task_graph(walk: Walk, tmp_path: Path) -> None:
+    with Image.open(plots.task_graph(walk, NAMES, tmp_path / "g.png")) as image:
+        assert min(image.size) > 100
+
+
+def test_an_animation_has_a_frame_for_each_state(walk: Walk, tmp_path: Path) -> None:
+    with Image.open(plots.animation(walk, NAMES, tmp_path / "e.gif")) as image:
+        assert image.format == "GIF"
+        assert image.n_frames == len(walk.cells)
+        frames = []
+        for i in range(image.n_frames):
+            image.seek(i)
+            frames.append(np.asarray(image.convert("RGB"), int))
+    size = 5 * plots._CELL
+    assert all(frame.shape == (size + 28, size, 3) for frame in frames)
+    assert all((first != second).any() for first, second in itertools.pairwise(frames))
+
+
+def test_learning_curves_of_several_runs(tmp_path: Path) -> None:
+    rows = [{"env_steps": step, "eval/success_rate": step / 100, "eval/spl": None, "level": 1} for step in (0, 50, 100)]
+    one, two = tmp_path / "one.png", tmp_path / "two.png"
+    assert plots.learning_curves({"a": rows}, one) == one
+    plots.learning_curves({"a": rows, "b": rows[:2]}, two)
+    plots.learning_curves({"a": []}, tmp_path / "none.png")
+    assert one.read_bytes() != two.read_bytes()
