@@ -214,7 +214,9 @@ def subtree(tree: TaskTree, node: int, num_nodes: int) -> tuple[TaskTree, list[i
     for k in range(tree.num_nodes):
         if tree.valid[k] and tree.parent[k] in rows:
             rows.append(k)
-    cut = jax.tree.map(lambda x: np.concatenate([x[rows], np.zeros((num_nodes - len(rows), *x.shape[1:]), x.dtype)]), tree)
+    cut = jax.tree.map(
+        lambda x: np.concatenate([x[rows], np.zeros((num_nodes - len(rows), *x.shape[1:]), x.dtype)]), tree
+    )
     parent = np.full(num_nodes, TaskTree.NO_NODE, np.int32)
     parent[1 : len(rows)] = [rows.index(int(p)) for p in tree.parent[rows[1:]]]
     used = np.arange(num_nodes) > 0
@@ -230,5 +232,7 @@ def subtree(tree: TaskTree, node: int, num_nodes: int) -> tuple[TaskTree, list[i
 def padded(tree: TaskTree, num_nodes: int) -> TaskTree:
     """The same task with more padding."""
     extra = num_nodes - tree.num_nodes
-    wide = jax.tree.map(lambda x: np.concatenate([x, np.zeros((extra, *x.shape[1:]), x.dtype)]), jax.tree.map(np.asarray, tree))
+    wide = jax.tree.map(
+        lambda x: np.concatenate([x, np.zeros((extra, *x.shape[1:]), x.dtype)]), jax.tree.map(np.asarray, tree)
+    )
     return wide.replace(parent=np.where(wide.valid & (np.arange(num_nodes) > 0), wide.parent, TaskTree.NO_NODE))

@@ -115,7 +115,11 @@ def test_the_book_holds_each_sub_tasks_avoid_set(agent: Agent, trees: TaskTree) 
 def test_myopic_low_sees_nothing_of_the_future(trees: TaskTree) -> None:
     agent, sighted = Agent(Corridor(), small_config(future_embedding=False)), Agent(Corridor(), small_config())
     params = random_params(agent, 0)
-    for name, told in (("myopic", agent.open_book(params, trees).told), ("ours", sighted.open_book(params, trees).told)):
-        assert np.asarray(told.reach).any() and np.asarray(told.avoid).any()
+    for name, told in (
+        ("myopic", agent.open_book(params, trees).told),
+        ("ours", sighted.open_book(params, trees).told),
+    ):
+        assert np.asarray(told.reach).any()
+        assert np.asarray(told.avoid).any()
         for future in (told.future, told.ahead):
             assert np.asarray(future).any() == (name == "ours")

@@ -55,7 +55,9 @@ def test_policy_gradient_stops_where_the_step_is_long_enough(shift: float, advan
 
 def test_masked_samples_with_senseless_log_probabilities_do_no_harm() -> None:
     def loss(x: jax.Array) -> jax.Array:
-        return ppo.policy_loss(jnp.stack([x, x - 1e9]), jnp.array([0.0, 500.0]), jnp.ones(2), jnp.array([True, False]), 0.2)
+        return ppo.policy_loss(
+            jnp.stack([x, x - 1e9]), jnp.array([0.0, 500.0]), jnp.ones(2), jnp.array([True, False]), 0.2
+        )
 
     value, gradient = jax.value_and_grad(loss)(jnp.float32(0.0))
     assert (float(value), float(gradient)) == (-1, -1)

@@ -65,9 +65,7 @@ def play(rng: np.random.Generator, conjunctions: bool) -> dict[str, np.ndarray]:
 def _task(rng: np.random.Generator, conjunctions: bool) -> TaskTree:
     if conjunctions:
         return random_tree(rng, num_nodes=8, num_propositions=5, most_together=2, distinct=True)
-    trees = sample_trees(
-        rng, num_tasks=1, num_propositions=5, max_nodes=9, min_depth=1, max_depth=6, max_branching=3
-    )
+    trees = sample_trees(rng, num_tasks=1, num_propositions=5, max_nodes=9, min_depth=1, max_depth=6, max_branching=3)
     return jax.tree.map(lambda x: x[0], trees)
 
 
@@ -213,10 +211,14 @@ def test_trees_are_well_formed_and_follow_the_samplers_rules(setting: Setting) -
         nodes = np.flatnonzero(tree.valid)
         children = {k: [j for j in nodes if tree.parent[j] == k] for k in nodes}
         assert tree.parent[0] == TaskTree.NO_NODE
-        assert not tree.reach[0].any() and not tree.avoid[0].any() and tree.depth[0] == 0
+        assert not tree.reach[0].any()
+        assert not tree.avoid[0].any()
+        assert tree.depth[0] == 0
         padding = ~tree.valid
         assert (tree.parent[padding] == TaskTree.NO_NODE).all()
-        assert not (tree.reach[padding].any() or tree.avoid[padding].any() or tree.accepting[padding].any())
+        assert not (tree.reach[padding].any())
+        assert not (tree.avoid[padding].any())
+        assert not (tree.accepting[padding].any())
         assert not tree.depth[padding].any()
         for k in nodes:
             assert tree.accepting[k] == (not children[k])
@@ -224,17 +226,20 @@ def test_trees_are_well_formed_and_follow_the_samplers_rules(setting: Setting) -
             assert len(set(goals)) == len(goals) <= 2
         for k in nodes[1:]:
             parent = tree.parent[k]
-            assert 0 <= parent < k and tree.valid[parent]
+            assert 0 <= parent < k
+            assert tree.valid[parent]
             assert tree.depth[k] == tree.depth[parent] + 1
             if k <= setting.max_path:
                 continue
             branches += 1
             goal, before, avoid = pairs(tree.reach[k]), pairs(tree.reach[parent]), pairs(tree.avoid[k])
-            assert len(goal) == 1 and not goal & before and not avoid & (goal | before)
+            assert len(goal) == 1
+            assert not goal & before
+            assert not avoid & (goal | before)
             sizes.add(len(avoid))
-        assert set(range(length + 1)) <= set(nodes) and not set(range(length + 1, setting.max_path + 1)) & set(nodes)
-        for k in range(1, length):  # A branch is no longer than what remains of the path beside it.
-            assert max(tree.depth[nodes]) <= length
+        assert set(range(length + 1)) <= set(nodes)
+        assert not set(range(length + 1, setting.max_path + 1)) & set(nodes)
+        assert max(tree.depth[nodes]) == length  # a branch is no longer than what remains of the path beside it
     assert branches > 100
     assert sizes == {0, 1, 2, 3} if not setting.conjunctions else sizes >= {0, 1, 2}
 
@@ -256,7 +261,8 @@ def test_reserved_tasks_are_never_produced() -> None:
         else:
             kept += 1
             np.testing.assert_array_equal(again.valid[i, steps], new.valid[i, steps])
-    assert kept > 20 and len(slots) - kept > 20
+    assert kept > 20
+    assert len(slots) - kept > 20
 
 
 @pytest.mark.parametrize("branch", [0, 1])

@@ -27,7 +27,7 @@ def pay(
 
 
 def episode(*steps: tuple[str, str]) -> tuple[np.ndarray, ...]:
-    """``(labels, what the edge taken reaches)`` per step, an empty second entry for no edge; the last edge completes."""
+    """``(labels, what the edge taken reaches)`` per step, the second empty for no edge; the last edge completes."""
     labels = np.array([[x in seen for x in LETTERS] for seen, _ in steps])
     reached = np.array([[x in goal for x in LETTERS] for _, goal in steps])
     taken = reached.any(-1)
@@ -36,7 +36,12 @@ def episode(*steps: tuple[str, str]) -> tuple[np.ndarray, ...]:
 
 
 def reference(
-    rules: list[Bonus], completion: float, subtask: float, labels: np.ndarray, reached: np.ndarray, taken: np.ndarray,
+    rules: list[Bonus],
+    completion: float,
+    subtask: float,
+    labels: np.ndarray,
+    reached: np.ndarray,
+    taken: np.ndarray,
     completed: np.ndarray,
 ) -> list[float]:
     """Looks at the whole episode for each rule: when is it paid, if ever?"""

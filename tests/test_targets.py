@@ -25,35 +25,39 @@ def draw(seed: int) -> dict[str, np.ndarray]:
     truncated = (rng.random((T, E)) < 0.15) & ~terminated
     decided = rng.random((T, E)) < 0.3
     decided[1:] |= (terminated | truncated)[:-1]
-    floats = {name: rng.normal(size=(T, E)).astype(np.float32) for name in ("reward", "value", "bootstrap", "plan_value")}
+    floats = {
+        name: rng.normal(size=(T, E)).astype(np.float32) for name in ("reward", "value", "bootstrap", "plan_value")
+    }
     return {"terminated": terminated, "truncated": truncated, "decided": decided, **floats}
 
 
 def low_reference(x: dict[str, np.ndarray], gamma: float, lam: float, max_operator: bool) -> np.ndarray:
     """One number at a time, forwards: the return of step t looks up that of step t + 1."""
+    steps = x["reward"]
 
     def from_here(t: int, e: int) -> float:
         if x["terminated"][t, e]:
             return float(x["reward"][t, e])
-        if x["truncated"][t, e] or t == T - 1:
+        if x["truncated"][t, e] or t == len(steps) - 1:
             return x["reward"][t, e] + gamma * x["bootstrap"][t, e]
         later = from_here(t + 1, e)
         if max_operator and x["decided"][t + 1, e]:
             later = max(later, x["plan_value"][t + 1, e])
         return x["reward"][t, e] + gamma * ((1 - lam) * x["value"][t + 1, e] + lam * later)
 
-    return np.array([[from_here(t, e) for e in range(E)] for t in range(T)])
+    return np.array([[from_here(t, e) for e in range(steps.shape[1])] for t in range(len(steps))])
 
 
 def plan_reference(x: dict[str, np.ndarray], gamma: float, lam: float) -> dict[tuple[int, int], float]:
     """Advantage of each decision from its own reward R, duration and successor."""
     advantages: dict[tuple[int, int], float] = {}
-    for e in range(E):
+    last, num_envs = x["reward"].shape[0] - 1, x["reward"].shape[1]
+    for e in range(num_envs):
         for t in reversed(np.flatnonzero(x["decided"][:, e]).tolist()):
             reward, tau = 0.0, t
             while True:
                 reward += gamma ** (tau - t) * x["reward"][tau, e]
-                ends = x["terminated"][tau, e] or x["truncated"][tau, e] or tau == T - 1
+                ends = x["terminated"][tau, e] or x["truncated"][tau, e] or tau == last
                 if ends or x["decided"][tau + 1, e]:
                     break
                 tau += 1
@@ -123,7 +127,13 @@ def test_lambda_zero_is_the_one_step_target() -> None:
 
 
 def test_truncation_bootstraps_and_termination_does_not() -> None:
-    ends = {"bootstrap": {4: 2.0}, "reward": {4: 1.0}, "value": {5: 100.0}, "plan_value": {5: 100.0}, "decided": {5: True}}
+    ends = {
+        "bootstrap": {4: 2.0},
+        "reward": {4: 1.0},
+        "value": {5: 100.0},
+        "plan_value": {5: 100.0},
+        "decided": {5: True},
+    }
     truncated = run_low(quiet(truncated={4: True}, **ends), 0.5, 0.9, True)
     terminated = run_low(quiet(terminated={4: True}, **ends), 0.5, 0.9, True)
     assert truncated[4, 0] == pytest.approx(1 + 0.5 * 2)
