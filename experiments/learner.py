@@ -77,6 +77,7 @@ class Learner:
         self.trainer = Trainer(self.agent)
         self.machine: RewardMachine = rewards_of(experiment.env, experiment.reward_set)
         self._reserved = reserved_hashes(experiment.env)
+        self._reserved_on_device = jnp.asarray(self._reserved)
         self._bank: tuple[int, TaskTree] | None = None
         try:
             self._bank_of(0)
@@ -129,7 +130,9 @@ class Learner:
         return self.trainer.init(jax.random.key(self.experiment.seed), self._bank_of(0), self.machine)
 
     def _iterate(self, state: TrainState, index: int) -> tuple[TrainState, Mapping[str, jax.Array]]:
-        return self.trainer.iterate(state, self._bank_of(index // BANK_ITERATIONS), self.machine, self._reserved)
+        return self.trainer.iterate(
+            state, self._bank_of(index // BANK_ITERATIONS), self.machine, self._reserved_on_device
+        )
 
     def _bank_of(self, number: int) -> TaskTree:
         """A bank depends on the seed and its number alone, so that a resumed run draws the same ones."""

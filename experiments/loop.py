@@ -78,13 +78,15 @@ class Position:
         wall: seconds since the start, in all processes together.
         iterations: iterations since the last row.
         sums: metrics added up over them.
-        training: seconds spent on them.
+        timed: those of them whose time was taken: all but each process's first, which is the compiler's.
+        training: seconds spent on these.
     """
 
     done: int = 0
     wall: float = 0.0
     iterations: int = 0
     sums: dict[str, float] = dataclasses.field(default_factory=dict)
+    timed: int = 0
     training: float = 0.0
 
 
@@ -144,10 +146,16 @@ class Loop:
         job, at = self._job, self._at
         earlier, started = at.wall, time.monotonic()
         saved = mark = started
+        first = at.done
         while at.done < job.num_iterations:
             state, metrics = job.iterate(state, at.done)
             at.done += 1
             self._pending.append(metrics)
+            if at.done == first + 1:
+                self._collect(leave=0)
+                mark = time.monotonic()
+            else:
+                at.timed += 1
             evaluating, saving = job.evaluation_due(at.done), time.monotonic() - saved >= self._checkpoint_seconds
             pause = evaluating or saving or bool(stop)
             self._collect(leave=0 if pause else 1)
@@ -199,15 +207,14 @@ class Loop:
         """Adds a row."""
         at, job = self._at, self._job
         self._check(state)
-        rate = at.iterations * job.steps_per_iteration / max(at.training, 1e-9)
         row = {
             "env_steps": self._env_steps,
             "wall_s": round(at.wall, 3),
             **job.evaluate(state, self._env_steps),
             **job.summarise(at.sums, at.iterations),
-            "train/steps_per_s": round(rate, 1),
+            "train/steps_per_s": round(at.timed * job.steps_per_iteration / at.training, 1) if at.timed else None,
         }
-        at.iterations, at.sums, at.training = 0, {}, 0.0
+        at.iterations, at.sums, at.timed, at.training = 0, {}, 0, 0.0
         self._folder.append(row)
         self._display.row(row)
 

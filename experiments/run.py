@@ -109,7 +109,7 @@ def _finish(
         "name": learner.experiment.name,
         "env_steps": env_steps,
         "wall_s": wall,
-        "train/steps_per_s": env_steps / wall,
+        "steps_per_s": env_steps / wall,  # compilation and evaluations included
         "final": results.to_json(),
         "pictures": pictures,
     }

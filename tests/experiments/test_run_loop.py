@@ -106,6 +106,26 @@ def test_rows_come_where_an_evaluation_is_due(reference: tuple[Path, str, list[f
     assert checkpoint.steps(folder / "checkpoints") == [ITERATIONS * STEPS]
 
 
+def test_neither_the_compiler_nor_an_evaluation_slows_the_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 0.0
+    monkeypatch.setattr("experiments.loop.time.monotonic", lambda: now)
+
+    def iterate(state: Any, index: int) -> Any:
+        nonlocal now
+        now += 2.0 if index else 500.0
+        return step(state, index)
+
+    def evaluate(state: Any, env_steps: int) -> dict[str, Any]:
+        nonlocal now
+        now += 30.0
+        return {}
+
+    train(tmp_path, toy(iterate=iterate, evaluate=evaluate))
+    rows = read_metrics(tmp_path)
+    assert [row["train/steps_per_s"] for row in rows] == [STEPS / 2] * 5
+    assert [row["wall_s"] for row in rows] == [504, 538, 574, 608, 644]
+
+
 def test_dispatch_runs_one_iteration_ahead_of_the_metrics(tmp_path: Path) -> None:
     events: list[str] = []
 
@@ -118,7 +138,7 @@ def test_dispatch_runs_one_iteration_ahead_of_the_metrics(tmp_path: Path) -> Non
             events.append(f"got {env_steps // STEPS - 1}")
 
     train(tmp_path, toy(iterate=iterate, num_iterations=4, evaluate_every=10**9), Watcher())
-    assert events == ["go 0", "go 1", "got 0", "go 2", "got 1", "go 3", "got 2", "got 3"]
+    assert events == ["go 0", "got 0", "go 1", "go 2", "got 1", "go 3", "got 2", "got 3"]
 
 
 @pytest.mark.parametrize("at", [1, 2, 3, 7, ITERATIONS - 1, ITERATIONS])
