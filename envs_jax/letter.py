@@ -211,6 +211,12 @@ class Letter(Environment):
         """The agent's cell as a state of :meth:`transition_table`, int32 ``[]``."""
         return state.position[0] * self.size + state.position[1]
 
+    def distances(self) -> jax.Array:
+        """Moves between any two cells of the torus, int32 ``[S, S]``; the layout forbids none."""
+        rows, columns = np.divmod(np.arange(self.size**2), self.size)
+        apart = [np.abs(x[:, None] - x[None, :]) for x in (rows, columns)]
+        return jnp.asarray(sum(np.minimum(d, self.size - d) for d in apart), jnp.int32)
+
     def _place_letters(self, key: jax.Array) -> jax.Array:
         """Letters on uniformly drawn cells other than (0, 0), int8 ``[n, n]``.
 

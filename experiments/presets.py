@@ -1,11 +1,11 @@
-"""Tuned configurations, a comment for each deviation from the defaults, and the environments' reward sets."""
+"""Tuned configurations, a comment for each deviation from the paper, and the environments' reward sets."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import envs_jax
-from hrlspec.config import Config
+from hrlspec.config import Config, CurriculumConfig, NetworkConfig, PPOConfig, RelabelConfig, ShieldConfig
 from hrlspec.rewards import Bonus, RewardMachine, reward_machine
 
 # Letter's order bonuses (paper, "Reward Function of Subgoals").
@@ -17,23 +17,61 @@ def preset(env_name: str, recipe: str, reward_set: int, method: str) -> Config:
 
     Args:
         env_name: one of ``envs_jax.registered()``.
-        recipe: ``paper`` or ``hrlspec``.
+        recipe: ``paper``, which is the defaults of :class:`Config`, or ``hrlspec``.
         reward_set: 1 or 2.
         method: ``ours``, ``myopic-low`` or ``no-er``.
     """
-    del env_name
-    config = Config()
-    if recipe == "hrlspec":
-        config = dataclasses.replace(
-            config, unfinished=True, curriculum=dataclasses.replace(config.curriculum, tree_share=0.5)
-        )
+    config = Config() if recipe == "paper" else hrlspec()
+    if env_name == "letter12":
+        config = letter12(config)
     if reward_set == 2:
-        config = dataclasses.replace(config, value_scale=10.0)  # returns reach 20
+        # Returns reach 18; and a bonus at the end of a long branch must outweigh a short one.
+        config = dataclasses.replace(config, value_scale=5.0, discount=0.97)
     if method == "myopic-low":
         config = dataclasses.replace(config, future_embedding=False)
     if method == "no-er":
         config = dataclasses.replace(config, relabel=dataclasses.replace(config.relabel, share=0.0))
     return config
+
+
+def hrlspec() -> Config:
+    """What measured better than the paper's choices; the measurements are in ``docs/decisions.md``."""
+    return Config(
+        total_steps=2_500_000,
+        # Sharper than 0.94: a detour of two steps costs 15 % of the return.
+        discount=0.92,
+        # It raises what bad instances lead to up to the planner's average guess, and so hides the difference.
+        max_operator=False,
+        unfinished=True,
+        low=PPOConfig(learning_rate=7e-4, epochs=2, minibatches=16, entropy=0.01, final_entropy=0.002),
+        high=PPOConfig(learning_rate=3e-4, epochs=2, minibatches=4, entropy=0.005, final_entropy=0.005),
+        network=NetworkConfig(
+            # Seen by role the grid needs no convolution: a third of the time, and no worse.
+            conv_channels=(),
+            encoder_mlp=(256, 256),
+            roles=True,
+            lookahead=3,
+            # One sweep instead of 8 rounds: an eighth of the arithmetic, and no limit to look-ahead.
+            planner_rounds=0,
+            task_rounds=0,
+            planner_policy=(128,),
+            child_embeddings=True,
+            advice=30.0,
+        ),
+        curriculum=CurriculumConfig(tree_share=0.5, earlier=0.4, contested=0.5),
+        relabel=RelabelConfig(share=0.25),
+        # The policy learns to avoid by itself; shielded steps are lost to it.
+        shield=ShieldConfig(mode="off"),
+    )
+
+
+def letter12(config: Config) -> Config:
+    """Twelve letters, sequences of up to six sub-tasks."""
+    return dataclasses.replace(
+        config,
+        total_steps=5_000_000,
+        curriculum=dataclasses.replace(config.curriculum, levels=6, max_nodes=24),
+    )
 
 
 def rewards_of(env_name: str, reward_set: int) -> RewardMachine:

@@ -8,21 +8,22 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from envs_jax import Environment
+from envs_jax import Discrete, Environment
 from hrlspec.config import Config
 from hrlspec.networks.controller import Controller, Instruction
 from hrlspec.networks.planner import Planner
 from hrlspec.networks.reach_critic import ReachCritic
-from hrlspec.spec import TaskState, TaskTree, initial
+from hrlspec.spec import TaskState, TaskTree, initial, open_edges
 
 View = tuple[jax.Array, jax.Array]
 Params = dict[str, Any]
+Estimate = tuple[jax.Array, jax.Array]  # logits and value
 
 
 @struct.dataclass
@@ -50,6 +51,14 @@ class Agent:
     env: Environment
     config: Config
 
+    @property
+    def num_actions(self) -> int:
+        """A. Only discrete actions are supported."""
+        space = self.env.action_space
+        if not isinstance(space, Discrete):
+            raise TypeError(f"the agent needs a discrete action space, {self.env.name} has {space}")
+        return space.n
+
     @functools.cached_property
     def planner(self) -> Planner:
         """The high level."""
@@ -58,12 +67,12 @@ class Agent:
     @functools.cached_property
     def controller(self) -> Controller:
         """The low level."""
-        return Controller(self.config.network, self.env.action_space.n)
+        return Controller(self.config.network, self.num_actions)
 
     @functools.cached_property
     def reach_critic(self) -> ReachCritic:
         """The critic behind the shield."""
-        return ReachCritic(self.config.network.reach_critic, self.env.action_space.n)
+        return ReachCritic(self.config.network.reach_critic, self.num_actions)
 
     def init(self, key: jax.Array) -> Params:
         """Fresh parameters of the three networks: ``planner``, ``controller``, ``reach_critic``. The key is consumed."""
@@ -79,10 +88,10 @@ class Agent:
 
     def instruct(self, params: Params, tree: TaskTree) -> Instruction:
         """What the low level is told for every edge of one task, leading axis N; nothing of the future for Myopic-low."""
-        told = self.controller.apply(params["controller"], tree, method="instruct")
+        told: Any = self.controller.apply(params["controller"], tree, method="instruct")
         if not self.config.future_embedding:
-            told = told.replace(ahead=jnp.zeros_like(told.ahead), future=jnp.zeros_like(told.future))
-        return told
+            told = dataclasses.replace(told, ahead=jnp.zeros_like(told.ahead), future=jnp.zeros_like(told.future))
+        return cast(Instruction, told)
 
     def open_book(self, params: Params, trees: TaskTree) -> TaskBook:
         """Prepares tasks (leading axis M) for acting."""
@@ -94,20 +103,27 @@ class Agent:
         """The planner on one environment: logits over edges ``[N]`` and the value of the remaining task ``[]``."""
         advice = jnp.zeros(tree.num_nodes)
         if self.config.network.advice:
-            advice = self.advise(params, view, told)
-        return self.planner.apply(params["planner"], view, tree, state, advice)
+            advice = self.advise(params, view, told, open_edges(tree, state))
+        return cast(Estimate, self.planner.apply(params["planner"], view, tree, state, advice))
 
-    def advise(self, params: Params, view: View, told: Instruction) -> jax.Array:
-        """The low level's value of every edge's sub-task, ``[N]``."""
-        return jax.vmap(self.control, in_axes=(None, None, 0))(params, view, told)[1]
+    def advise(self, params: Params, view: View, told: Instruction, feasible: jax.Array) -> jax.Array:
+        """The low level's value of the feasible edges' sub-tasks, ``[N]``; without gradient."""
+        num_nodes = feasible.shape[0]
+        size = min(self.config.network.advised, num_nodes)
+        edges = jnp.nonzero(feasible, size=size, fill_value=num_nodes)[0]
+        some = jax.tree.map(lambda x: x[jnp.minimum(edges, num_nodes - 1)], told)
+        values = jax.vmap(self.control, in_axes=(None, None, 0))(params, view, some)[1]
+        worst = jnp.where(edges < num_nodes, values, jnp.inf).min()
+        worst = jnp.where(feasible.any(), worst, 0.0)
+        return jax.lax.stop_gradient(jnp.full(num_nodes, worst).at[edges].set(values, mode="drop"))
 
     def control(self, params: Params, view: View, told: Instruction) -> tuple[jax.Array, jax.Array]:
         """The low level on one environment: action logits ``[A]`` and value ``[]``."""
-        return self.controller.apply(params["controller"], view, told)
+        return cast(Estimate, self.controller.apply(params["controller"], view, told))
 
     def reach_values(self, params: Params, view: View) -> jax.Array:
         """Q(s, g, a) of reaching each proposition, float32 ``[P, A]``."""
-        return self.reach_critic.apply(params["reach_critic"], view)
+        return cast(jax.Array, self.reach_critic.apply(params["reach_critic"], view))
 
 
 def sample(logits: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -132,9 +148,7 @@ def shielded_action(agent: Agent, params: Params, view: View, avoid: jax.Array, 
     return jnp.where(danger[nearest] > shield.threshold, jnp.argmin(away), action).astype(jnp.int32)
 
 
-def in_groups(
-    function: Callable[[Any], Any], needed: jax.Array, inputs: Any, outputs: Any, group: int
-) -> Any:
+def in_groups(function: Callable[[Any], Any], needed: jax.Array, inputs: Any, outputs: Any, group: int) -> Any:
     """Applies a costly function only to the environments that need it.
 
     A vmapped ``cond`` would compute it for all of them at every step. Instead the waiting ones are gathered

@@ -9,6 +9,8 @@ Axes: **V** environments and relabelled copies, **T** time steps, **S** episodes
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -53,6 +55,7 @@ class PlanBatch:
     reached: jax.Array  # bool [B, P], p₊ of the sub-task that was completed
     next_view: View  # observation when it was
     completed: jax.Array  # bool, it was, within the episode
+    advice: jax.Array  # float32 [B, N], the low level's values at the start of the update; zeros when not used
     valid: jax.Array  # bool
 
 
@@ -189,7 +192,7 @@ def _copies(
     def plan(inputs: tuple[View, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         view, row, node, edge = inputs
         tree, told = jax.tree.map(lambda x: x[row], (fresh.tree, fresh.told))
-        state = jax.vmap(initial)(tree).replace(node=node)
+        state = dataclasses.replace(jax.vmap(initial)(tree), node=node)
         logits, value = jax.vmap(agent.plan, in_axes=(None, 0, 0, 0, 0))(params, view, tree, state, told)
         return jnp.take_along_axis(jax.nn.log_softmax(logits), edge[:, None], 1)[:, 0], value
 
@@ -293,6 +296,7 @@ def _pick_decisions(
         reached=x.reached[row, end],
         next_view=jax.tree.map(lambda a: a[row, after], x.view),
         completed=goes_on,
+        advice=jnp.zeros((size, x.blocked.shape[-1])),
         valid=score >= 0,
     )
 
@@ -300,4 +304,4 @@ def _pick_decisions(
 def plan_state(batch: PlanBatch) -> TaskState:
     """The task states of planner samples (leading axis B)."""
     state = jax.vmap(initial)(batch.tree)
-    return state.replace(node=batch.node, blocked=batch.blocked)
+    return dataclasses.replace(state, node=batch.node, blocked=batch.blocked)

@@ -44,8 +44,11 @@ class NetworkConfig:
     """How many later sub-tasks have a role of their own."""
     child_embeddings: bool = False
     """Whether the planner's logit of an edge also sees the embedding of the node it leads to."""
-    advice: bool = False
-    """Whether the planner also sees the low level's value of each candidate sub-task (gradient stopped)."""
+    advice: float = 0.0
+    """Weight of the low level's value of each candidate sub-task in the planner's logits (gradient stopped); the planner
+    learns a correction to it. 0: the planner judges alone, as in the paper."""
+    advised: int = 6
+    """Candidates that get advice of their own; further ones count as the worst of these."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +81,10 @@ class CurriculumConfig:
     """Share of episodes on levels already passed."""
     tree_share: float = 0.0
     """Share of random trees, instead of sequences, in each level's tasks."""
+    contested: float = 0.0
+    """Share of episodes whose layout is the best of ``candidates`` for teaching look-ahead: the one where nearest-first loses
+    most. Only in environments that know the distances between their states."""
+    candidates: int = 8
     max_branching: int = 3
     max_avoid: int = 3
     tasks_per_level: int = 512

@@ -5,6 +5,8 @@ Axes: **L** levels, **M** tasks per level, **E** environments.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -62,7 +64,7 @@ def draw_bank(
     """
     levels = []
     num_trees = round(config.tree_share * config.tasks_per_level)
-    common = {"num_propositions": num_propositions, "max_nodes": config.max_nodes, "reserved": reserved}
+    common: dict[str, Any] = {"num_propositions": num_propositions, "max_nodes": config.max_nodes, "reserved": reserved}
     for level in range(1, config.levels + 1):
         parts = []
         if num_trees < config.tasks_per_level:

@@ -6,6 +6,7 @@ atomic propositions, **R** bonus rules.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -13,7 +14,8 @@ import jax.numpy as jnp
 from flax import struct
 
 from hrlspec import rewards
-from hrlspec.agent import Agent, Instruction, Params, TaskBook, View, in_groups, sample, shielded_action
+from hrlspec.agent import Agent, Params, TaskBook, View, in_groups, sample, shielded_action
+from hrlspec.networks.controller import Instruction
 from hrlspec.rewards import RewardMachine
 from hrlspec.spec import RUNNING, SATISFIED, TaskState, TaskTree, advance, initial
 
@@ -67,7 +69,9 @@ def task_of(book: TaskBook, rows: jax.Array) -> TaskTree:
     return jax.tree.map(lambda x: x[rows], book.tree)
 
 
-def start(agent: Agent, machine: RewardMachine, layouts: Any, tasks: jax.Array, keys: jax.Array, book: TaskBook) -> Worker:
+def start(
+    agent: Agent, machine: RewardMachine, layouts: Any, tasks: jax.Array, keys: jax.Array, book: TaskBook
+) -> Worker:
     """Workers at the start of an episode in the given layouts with the given rows of the book, all leading axis E."""
     env = agent.env
     observation, env_state = jax.vmap(env.reset_to, in_axes=(0, 0, None))(layouts, keys, env.default_params)
@@ -114,7 +118,7 @@ def decide(agent: Agent, params: Params, book: TaskBook, worker: Worker, noise: 
     """Assigns a sub-task wherever one is due."""
     choice, log_prob, value = plan_where(agent, params, book, worker, worker.awaiting, noise)
     decision = Decision(made=worker.awaiting, log_prob=log_prob, value=value)
-    return worker.replace(assigned=choice, awaiting=jnp.zeros_like(worker.awaiting)), decision
+    return dataclasses.replace(worker, assigned=choice, awaiting=jnp.zeros_like(worker.awaiting)), decision
 
 
 def act(
@@ -157,7 +161,8 @@ def transition(
     )
     lost = jnp.take_along_axis(state.blocked, worker.assigned[:, None], 1)[:, 0]
     terminated = failed | (state.status != RUNNING)
-    worker = worker.replace(
+    worker = dataclasses.replace(
+        worker,
         env_state=env_state,
         view=jax.vmap(env.proposition_view)(observation),
         task_state=state,
@@ -176,7 +181,14 @@ def transition(
 
 
 def restart_where(
-    agent: Agent, machine: RewardMachine, worker: Worker, ended: jax.Array, layouts: Any, tasks: jax.Array, keys: jax.Array, book: TaskBook
+    agent: Agent,
+    machine: RewardMachine,
+    worker: Worker,
+    ended: jax.Array,
+    layouts: Any,
+    tasks: jax.Array,
+    keys: jax.Array,
+    book: TaskBook,
 ) -> Worker:
     """Replaces the workers in ``ended`` (bool ``[E]``) by fresh ones in the given layouts and tasks."""
     fresh = start(agent, machine, layouts, tasks, keys, book)

@@ -6,13 +6,14 @@ Axes: **T** time steps, **E** environments, **S** layouts of an environment's po
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from hrlspec import curriculum
+from hrlspec import curriculum, regret
 from hrlspec.agent import Agent, Params, TaskBook, View
 from hrlspec.interaction import Decision, Worker, act, plan_where, restart_where, transition
 from hrlspec.rewards import RewardMachine
@@ -48,6 +49,15 @@ class Trajectory:
 
 
 @struct.dataclass
+class Pool:
+    """What the next episodes start with, leading axes ``[E, S]``; environment e takes its S entries in turn."""
+
+    layout: Any
+    task: jax.Array  # int32, row of the task book
+    level: jax.Array  # int32, its curriculum level
+
+
+@struct.dataclass
 class Collector:
     """What goes on from one rollout to the next; leading axis E."""
 
@@ -57,6 +67,42 @@ class Collector:
     started: jax.Array  # int32 [E], episodes started so far, for the pool
 
 
+def fill_pool(key: jax.Array, agent: Agent, book: TaskBook, level: jax.Array, size: int) -> Pool:
+    """Draws tasks of the curriculum's levels and layouts for them, ``size`` for each environment. The key is consumed.
+
+    Where the configuration asks for contested layouts, several are drawn and the one where nearest-first loses
+    most is kept.
+    """
+    config = agent.config.curriculum
+    env: Any = agent.env  # what finite environments offer besides the contract is optional
+    selective = config.contested > 0 and hasattr(env, "distances")
+    candidates = config.candidates if selective else 1
+
+    def draw(key: jax.Array, task: jax.Array) -> Any:
+        keys = jax.random.split(key, candidates + 1)
+        layouts = jax.vmap(env.sample_layout, in_axes=(0, None))(keys[1:], env.default_params)
+        best = jnp.int32(0)
+        if selective:
+            first, second = regret.opening(jax.tree.map(lambda x: x[task], book.tree))
+
+            def lost(layout: Any) -> jax.Array:
+                _, labels, start = env.transition_table(layout, env.default_params)
+                return regret.myopia_regret(env.distances(), labels, start, first, second)
+
+            wanted = jax.random.bernoulli(keys[0], config.contested)
+            best = jnp.where(wanted, jnp.argmax(jax.vmap(lost)(layouts)), 0)
+        return jax.tree.map(lambda x: x[best], layouts)
+
+    def one(index: jax.Array) -> Pool:
+        keys = jax.random.split(jax.random.fold_in(key, index), 3)
+        levels = curriculum.draw_levels(keys[0], level, config.earlier, size)
+        rows = jax.random.randint(keys[1], (size,), 0, config.tasks_per_level)
+        tasks = (agent.config.num_envs + levels * config.tasks_per_level + rows).astype(jnp.int32)
+        return Pool(layout=jax.vmap(draw)(jax.random.split(keys[2], size), tasks), task=tasks, level=levels)
+
+    return jax.vmap(one)(jnp.arange(agent.config.num_envs))
+
+
 def collect(
     key: jax.Array,
     agent: Agent,
@@ -64,8 +110,7 @@ def collect(
     machine: RewardMachine,
     book: TaskBook,
     collector: Collector,
-    pool: Any,
-    level: jax.Array,
+    pool: Pool,
 ) -> tuple[Collector, Trajectory]:
     """Rolls out E×T steps. Workers come and go with a sub-task assigned: decisions are made at the end of a step.
 
@@ -76,37 +121,31 @@ def collect(
         machine: the rewards.
         book: tasks: the E running ones, then the bank, level by level.
         collector: where the last rollout stopped.
-        pool: fresh layouts ``[E, S, ...]``; environment e takes them in turn.
-        level: int32 ``[]``, the curriculum level.
+        pool: what the next episodes start with.
     """
     config = agent.config
     num_envs, num_nodes = config.num_envs, book.tree.parent.shape[-1]
-    pool_size = jax.tree.leaves(pool)[0].shape[1]
+    pool_size = pool.task.shape[1]
     envs = jnp.arange(num_envs)
 
     def randomness(env: jax.Array) -> tuple[jax.Array, ...]:
-        keys = jax.random.split(jax.random.fold_in(key, env), 5)
-        shape = (config.num_steps,)
-        levels = curriculum.draw_levels(keys[2], level, config.curriculum.earlier, config.num_steps)
-        rows = jax.random.randint(keys[3], shape, 0, config.curriculum.tasks_per_level)
+        keys = jax.random.split(jax.random.fold_in(key, env), 3)
         return (
             jax.random.gumbel(keys[0], (config.num_steps, num_nodes)),
-            jax.random.gumbel(keys[1], (config.num_steps, agent.env.action_space.n)),
-            levels,
-            num_envs + levels * config.curriculum.tasks_per_level + rows,
-            jax.random.split(keys[4], config.num_steps),
+            jax.random.gumbel(keys[1], (config.num_steps, agent.num_actions)),
+            jax.random.split(keys[2], config.num_steps),
         )
 
     def step(collector: Collector, inputs: tuple[jax.Array, ...]) -> tuple[Collector, Trajectory]:
-        plan_noise, noise, next_level, next_task, keys = inputs
+        plan_noise, noise, keys = inputs
         before, decision = collector.worker, collector.decision
         action, log_prob, value, shielded = act(agent, params, book, before, noise, shield=config.shield.mode != "off")
         step_keys, reset_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
         worker, outcome = transition(agent, machine, book, before, action, step_keys)
         ended = outcome.terminated | outcome.truncated
         started = collector.started + ended
-        layouts = jax.tree.map(lambda x: x[envs, started % pool_size], pool)
-        after = restart_where(agent, machine, worker, ended, layouts, next_task, reset_keys, book)
+        fresh = jax.tree.map(lambda x: x[envs, started % pool_size], pool)
+        after = restart_where(agent, machine, worker, ended, fresh.layout, fresh.task, reset_keys, book)
         # One pass of the planner serves the decisions that are due and the values of truncated states.
         both = jax.tree.map(lambda *x: jnp.concatenate(x), after, worker)
         needed = jnp.concatenate([after.awaiting, outcome.truncated])
@@ -138,22 +177,23 @@ def collect(
             level=collector.level,
         )
         collector = Collector(
-            worker=after.replace(assigned=choice[:num_envs], awaiting=jnp.zeros(num_envs, bool)),
+            worker=dataclasses.replace(after, assigned=choice[:num_envs], awaiting=jnp.zeros(num_envs, bool)),
             decision=Decision(after.awaiting, plan_log_prob[:num_envs], plan_value[:num_envs]),
-            level=jnp.where(ended, next_level, collector.level),
+            level=jnp.where(ended, fresh.level, collector.level),
             started=started,
         )
         return collector, record
 
     inputs = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), jax.vmap(randomness)(envs))
-    collector = collector.replace(started=jnp.zeros(num_envs, jnp.int32))
+    collector = dataclasses.replace(collector, started=jnp.zeros(num_envs, jnp.int32))
     collector, trajectory = jax.lax.scan(step, collector, inputs)
     worker = collector.worker
-    low = act(agent, params, book, worker, jnp.zeros((num_envs, agent.env.action_space.n)), shield=False)[2]
+    low = act(agent, params, book, worker, jnp.zeros((num_envs, agent.num_actions)), shield=False)[2]
     noise = jnp.zeros((num_envs, num_nodes))
     high = plan_where(agent, params, book, worker, jnp.ones(num_envs, bool), noise)[2]
     cut = trajectory.truncated[-1]
-    return collector, trajectory.replace(
+    return collector, dataclasses.replace(
+        trajectory,
         bootstrap=trajectory.bootstrap.at[-1].set(jnp.where(cut, trajectory.bootstrap[-1], low)),
         plan_bootstrap=trajectory.plan_bootstrap.at[-1].set(jnp.where(cut, trajectory.plan_bootstrap[-1], high)),
     )

@@ -45,7 +45,9 @@ def low_level_targets(
     raised = decided & max_operator
     cut = truncated.at[-1].set(True)
 
-    def backward(carry: tuple[jax.Array, jax.Array], inputs: tuple[jax.Array, ...]) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+    def backward(
+        carry: tuple[jax.Array, jax.Array], inputs: tuple[jax.Array, ...]
+    ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
         next_value, next_return = carry
         reward, terminated, cut, value, bootstrap, raised, planner_value = inputs
         ahead = (1 - gae_lambda) * next_value + gae_lambda * next_return

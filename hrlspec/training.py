@@ -22,8 +22,8 @@ from hrlspec.config import PPOConfig
 from hrlspec.curriculum import Curriculum
 from hrlspec.interaction import Decision, start
 from hrlspec.rewards import RewardMachine
-from hrlspec.rollout import Collector, Trajectory, collect
-from hrlspec.spec import TaskTree
+from hrlspec.rollout import Collector, Trajectory, collect, fill_pool
+from hrlspec.spec import TaskState, TaskTree, open_edges
 
 Metrics = dict[str, jax.Array]
 
@@ -79,9 +79,13 @@ class Trainer:
         worker = start(self.agent, machine, layouts, envs, keys(reset_key), self.agent.open_book(params, tasks))
         # Staggered clocks: episodes that fail at first would otherwise all be truncated in the same step.
         elapsed = jax.random.randint(stagger_key, (config.num_envs,), 0, env.horizon)
-        worker = worker.replace(env_state=worker.env_state.replace(time=elapsed.astype(jnp.int32)))
+        worker = dataclasses.replace(
+            worker, env_state=dataclasses.replace(worker.env_state, time=elapsed.astype(jnp.int32))
+        )
         # The very first sub-tasks are each task's first edge: not the planner's choice, hence no decision.
-        worker = worker.replace(assigned=jnp.ones(config.num_envs, jnp.int32), awaiting=jnp.zeros(config.num_envs, bool))
+        worker = dataclasses.replace(
+            worker, assigned=jnp.ones(config.num_envs, jnp.int32), awaiting=jnp.zeros(config.num_envs, bool)
+        )
         zeros = jnp.zeros(config.num_envs, jnp.int32)
         decision = Decision(made=zeros > 0, log_prob=jnp.zeros(config.num_envs), value=jnp.zeros(config.num_envs))
         transforms = self._transforms()
@@ -114,13 +118,12 @@ class Trainer:
         agent, config = self.agent, self.agent.config
         keys = jax.random.split(jax.random.fold_in(state.key, state.iteration), 5)
         book = agent.open_book(state.params, jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank))
-        collector = state.collector.replace(
-            worker=state.collector.worker.replace(task=jnp.arange(config.num_envs, dtype=jnp.int32))
+        collector = dataclasses.replace(
+            state.collector,
+            worker=dataclasses.replace(state.collector.worker, task=jnp.arange(config.num_envs, dtype=jnp.int32)),
         )
-        pool = self._pool(keys[0])
-        collector, trajectory = collect(
-            keys[1], agent, state.params, machine, book, collector, pool, state.curriculum.level
-        )
+        pool = fill_pool(keys[0], agent, book, state.curriculum.level, size=max(2, config.num_steps // 4))
+        collector, trajectory = collect(keys[1], agent, state.params, machine, book, collector, pool)
         low, plan = build(keys[2], agent, state.params, machine, book, trajectory, reserved)
         params, optimisers, losses = self._learn(keys[3], state, low, plan, trajectory)
         ended = trajectory.terminated | trajectory.truncated
@@ -148,17 +151,6 @@ class Trainer:
             "reach_critic": ppo.optimiser(1.0),
         }
 
-    def _pool(self, key: jax.Array) -> Any:
-        """Fresh layouts for the resets of one iteration, ``[E, S, ...]``."""
-        env, config = self.agent.env, self.agent.config
-        size = max(2, config.num_steps // 4)
-
-        def one(index: jax.Array) -> Any:
-            keys = jax.random.split(jax.random.fold_in(key, index), size)
-            return jax.vmap(env.sample_layout, in_axes=(0, None))(keys, env.default_params)
-
-        return jax.vmap(one)(jnp.arange(config.num_envs))
-
     def _learn(
         self, key: jax.Array, state: TrainState, low: LowBatch, plan: PlanBatch, trajectory: Trajectory
     ) -> tuple[Params, dict[str, Any], Metrics]:
@@ -185,10 +177,7 @@ class Trainer:
             metrics.update({f"{name}/{k}": v for k, v in result.items()})
 
         if config.network.advice:
-            # The planner must see the advice that its decisions were based on.
-            plan = (plan, _advice(agent, state.params, plan))
-        else:
-            plan = (plan, jnp.zeros(plan.tree.parent.shape))
+            plan = dataclasses.replace(plan, advice=_advice(agent, state.params, plan))
         train("controller", keys[0], low, config.low, controller_loss)
         train("planner", keys[1], plan, config.high, planner_loss)
         if config.shield.mode != "off":
@@ -224,13 +213,13 @@ def controller_loss(
 
 
 def planner_loss(
-    agent: Agent, params: Any, batch: tuple[PlanBatch, jax.Array], settings: PPOConfig, entropy_weight: jax.Array
+    agent: Agent, params: Any, batch: PlanBatch, settings: PPOConfig, entropy_weight: jax.Array
 ) -> tuple[jax.Array, Metrics]:
     """PPO and TransE loss of the planner on a minibatch ``[B]`` (eqs. 4 and 5)."""
-    config, planner = agent.config, agent.planner
-    batch, advice = batch
-    logits, value = jax.vmap(planner.apply, in_axes=(None, 0, 0, 0, 0))(
-        params, batch.view, batch.tree, plan_state(batch), advice
+    config = agent.config
+    apply: Any = agent.planner.apply
+    logits, value = jax.vmap(apply, in_axes=(None, 0, 0, 0, 0))(
+        params, batch.view, batch.tree, plan_state(batch), batch.advice
     )
     log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), batch.edge[:, None], 1)[:, 0]
     advantage = ppo.normalise(batch.advantage, batch.valid)
@@ -247,9 +236,9 @@ def planner_loss(
 
 def transe_loss(agent: Agent, params: Any, batch: PlanBatch) -> jax.Array:
     """Predicted latents near the ones reached, other states' latents at least the margin away (eq. 4)."""
-    planner = agent.planner
+    planner: Any = agent.planner
 
-    def encode(view: Any) -> jax.Array:
+    def encode(view: Any) -> Any:
         return jax.vmap(lambda v: planner.apply(params, v, method="encode"))(view)
 
     here, there = encode(batch.view), encode(batch.next_view)
@@ -298,12 +287,12 @@ def reach_loss(
 
 
 def _advice(agent: Agent, params: Params, batch: PlanBatch) -> jax.Array:
-    """The low level's value of every edge's sub-task, ``[B, N]``, at the start of the update."""
+    """The low level's advice on each decision, ``[B, N]``, at the start of the update."""
 
-    def one(view: Any, tree: TaskTree) -> jax.Array:
-        return agent.advise(params, view, agent.instruct(params, tree))
+    def one(view: Any, tree: TaskTree, state: TaskState) -> jax.Array:
+        return agent.advise(params, view, agent.instruct(params, tree), open_edges(tree, state))
 
-    return jax.vmap(one)(batch.view, batch.tree)
+    return jax.vmap(one)(batch.view, batch.tree, plan_state(batch))
 
 
 def _fit(

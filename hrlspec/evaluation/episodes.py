@@ -5,6 +5,7 @@ Axes: **B** episodes, **H** horizon, **N** tree nodes.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -131,10 +132,10 @@ def _run(
     def step(carry: tuple[Any, ...]) -> tuple[tuple[Any, ...], Trace]:
         worker, outcome, running, time = carry
         step_key, plan_key, act_key = jax.random.split(jax.random.fold_in(key, num_episodes + time), 3)
-        worker = worker.replace(awaiting=worker.awaiting & running)
+        worker = dataclasses.replace(worker, awaiting=worker.awaiting & running)
         noise = noise_scale * jax.random.gumbel(plan_key, (num_episodes, num_nodes))
         worker, _ = decide(agent, params, book, worker, noise)
-        noise = noise_scale * jax.random.gumbel(act_key, (num_episodes, agent.env.action_space.n))
+        noise = noise_scale * jax.random.gumbel(act_key, (num_episodes, agent.num_actions))
         action, *_ = act(agent, params, book, worker, noise, shield=shield)
         seen = Trace(worker.env_state, worker.task_state.node, worker.assigned, running)
         worker, result = transition(agent, machine, book, worker, action, jax.random.split(step_key, num_episodes))

@@ -97,13 +97,14 @@ class Planner(nn.Module):
         embeddings = self.embed(self.latent_tree(latent, tree, state.node), tree, state)
         root = embeddings[state.node]
         feasible = open_edges(tree, state)
-        best = jnp.where(feasible, advice, -jnp.inf).max(initial=-1e3)
-        best = jnp.where(feasible.any(), best, 0.0)
         inputs = [jnp.broadcast_to(root, embeddings.shape), tree.reach, subtask_avoid(tree)]
         if self.config.child_embeddings:
             inputs.append(embeddings)
+        # The advice counts relative to the best candidate's, which is also the first guess of the value.
+        best = jnp.where(feasible.any(), jnp.where(feasible, advice, -jnp.inf).max(), 0.0)
+        behind = jnp.where(feasible, self.config.advice * (advice - best), 0.0)
         if self.config.advice:
-            inputs.append((advice - best)[:, None] * feasible[:, None])
-        logits = self.policy(jnp.concatenate([x.astype(jnp.float32) for x in inputs], -1))[:, 0]
-        value = self.value(jnp.append(root, best) if self.config.advice else root)[0]
+            inputs.append(behind[:, None])
+        logits = self.policy(jnp.concatenate([x.astype(jnp.float32) for x in inputs], -1))[:, 0] + behind
+        value = self.value(root)[0] + best
         return jnp.where(feasible, logits, MASKED), value
