@@ -1,4 +1,4 @@
-"""Evaluation: success, SPL, return over optimum and contested choice on unseen tasks (DESIGN §7)."""
+"""Evaluation: success, SPL, return over optimum and contested choice on unseen tasks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Several runs of one method put together (DESIGN §7, "Aggregates over seeds").
+"""Several runs of one method put together.
 
 Axes: **S** runs, **M** tasks.
 """

@@ -133,7 +133,7 @@ class SuiteResult:
 
 @dataclasses.dataclass(frozen=True)
 class ReturnResult:
-    """Return over optimum where the branch matters (DESIGN §7).
+    """Return over optimum where the branch matters.
 
     The ratio is taken case by case, undiscounted return divided by the optimum within the horizon, and then averaged
     over cases, so that tasks with large returns count no more than others.
@@ -179,7 +179,7 @@ class ReturnResult:
 
 @dataclasses.dataclass(frozen=True)
 class ChoiceResult:
-    """Contested choice (DESIGN §7): the mean of the two rates of right choices.
+    """Contested choice: the mean of the two rates of right choices.
 
     Always taking the nearest instance scores 0.5, and so does always taking a farther one.
 
