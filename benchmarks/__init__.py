@@ -1,0 +1,1 @@
+"""Throughput scripts; see ``README.md`` beside this file."""

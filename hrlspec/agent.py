@@ -75,7 +75,7 @@ class Agent:
         return ReachCritic(self.config.network.reach_critic, self.num_actions)
 
     def init(self, key: jax.Array) -> Params:
-        """Fresh parameters of the three networks: ``planner``, ``controller``, ``reach_critic``. The key is consumed."""
+        """Fresh parameters: ``planner``, ``controller``, ``reach_critic``. The key is consumed."""
         keys = jax.random.split(key, 3)
         view = self.env.proposition_view(jnp.zeros(self.env.observation_shape))
         tree = _blank_tree(self.env.num_propositions)
@@ -87,7 +87,7 @@ class Agent:
         }
 
     def instruct(self, params: Params, tree: TaskTree) -> Instruction:
-        """What the low level is told for every edge of one task, leading axis N; nothing of the future for Myopic-low."""
+        """The instruction for every edge of one task, leading axis N; it says nothing of the future for Myopic-low."""
         told: Any = self.controller.apply(params["controller"], tree, method="instruct")
         if not self.config.future_embedding:
             told = dataclasses.replace(told, ahead=jnp.zeros_like(told.ahead), future=jnp.zeros_like(told.future))

@@ -27,8 +27,8 @@ class NetworkConfig:
     planner_policy: tuple[int, ...] = (128, 128, 128)
     """Hidden units of the planner's policy, which is applied to every edge."""
     planner_rounds: int = 8
-    """Rounds of message passing of the planner; look-ahead ends at this depth. 0: one sweep from the leaves to the root,
-    which looks ahead without limit and costs an eighth."""
+    """Rounds of message passing of the planner; look-ahead ends at this depth. 0: one sweep from the leaves to the
+    root, which looks ahead without limit and costs an eighth."""
     task_features: int = 32
     """Node features of the low level's GNN over the remaining tasks."""
     task_rounds: int = 8
@@ -38,15 +38,15 @@ class NetworkConfig:
     reach_critic: tuple[int, ...] = (64, 64)
     """Hidden units of the critic behind the shield."""
     roles: bool = False
-    """Task-conditioned encoding: the low level sees the observation by role (the goal p₊, the forbidden p₋, what comes 1, 2, ...
-    sub-tasks later) instead of by name. Off encodes the observation without the task, as in the paper."""
+    """Task-conditioned encoding: the low level sees the observation by role (the goal p₊, the forbidden p₋, what comes
+    1, 2, ... sub-tasks later) instead of by name. Off encodes the observation without the task, as in the paper."""
     lookahead: int = 2
     """How many later sub-tasks have a role of their own."""
     child_embeddings: bool = False
     """Whether the planner's logit of an edge also sees the embedding of the node it leads to."""
     advice: float = 0.0
-    """Weight of the low level's value of each candidate sub-task in the planner's logits (gradient stopped); the planner
-    learns a correction to it. 0: the planner judges alone, as in the paper."""
+    """Weight of the low level's value of each candidate sub-task in the planner's logits (gradient stopped); the
+    planner learns a correction to it. 0: the planner judges alone, as in the paper."""
     advised: int = 6
     """Candidates that get advice of their own; further ones count as the worst of these."""
 
@@ -63,6 +63,9 @@ class PPOConfig:
     entropy: float = 0.002
     final_entropy: float = 0.002
     value_coefficient: float = 0.5
+    expectile: float = 0.5
+    """What the critic learns of the returns: 0.5 their mean, above it an optimistic expectile, which in deterministic
+    worlds approaches the best return within reach."""
     gae_lambda: float = 0.95
     max_grad_norm: float = 0.5
 
@@ -82,8 +85,8 @@ class CurriculumConfig:
     tree_share: float = 0.0
     """Share of random trees, instead of sequences, in each level's tasks."""
     contested: float = 0.0
-    """Share of episodes whose layout is the best of ``candidates`` for teaching look-ahead: the one where nearest-first loses
-    most. Only in environments that know the distances between their states."""
+    """Share of episodes whose layout is the best of ``candidates`` for teaching look-ahead: the one where
+    nearest-first loses most. Only in environments that know the distances between their states."""
     candidates: int = 8
     max_branching: int = 3
     max_avoid: int = 3
@@ -108,8 +111,8 @@ class ShieldConfig:
     """Proposition avoidance (paper, "Avoiding Propositions")."""
 
     mode: Literal["off", "state", "action"] = "state"
-    """``state`` replaces the action wherever a forbidden proposition is near, as in the paper; ``action`` only where the
-    chosen action itself leads to it."""
+    """``state`` replaces the action wherever a forbidden proposition is near, as in the paper; ``action`` only where
+    the chosen action itself leads to it."""
     threshold: float = 0.9
     """ν: V(s, g) above it counts as near."""
     discount: float = 0.85

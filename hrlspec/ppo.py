@@ -33,6 +33,13 @@ def policy_loss(log_prob: jax.Array, old: jax.Array, advantage: jax.Array, mask:
     return -masked_mean(surrogate, mask)
 
 
+def value_loss(value: jax.Array, target: jax.Array, mask: jax.Array, expectile: float) -> jax.Array:
+    """Squared error, errors below the target weighted by 2τ and those above by 2(1 − τ); τ = 0.5 is the plain one."""
+    error = target - value
+    weight = 2.0 * jnp.where(error > 0, expectile, 1.0 - expectile)
+    return masked_mean(weight * error**2, mask)
+
+
 def entropy(logits: jax.Array) -> jax.Array:
     """Entropy of categorical distributions ``[..., A]``, in nats."""
     log_probs = jax.nn.log_softmax(logits)

@@ -14,7 +14,7 @@ FAR = 1_000_000
 
 
 def opening(tree: TaskTree) -> tuple[jax.Array, jax.Array]:
-    """What a task's first edge reaches and what the first edge after it does, bool ``[P]`` each; nothing if there is none."""
+    """What a task's first edge reaches and what the first edge after it does, bool ``[P]`` each; all false if none."""
     second = (tree.parent == 1) & tree.valid
     return tree.reach[1], tree.reach[jnp.argmax(second)] & second.any()
 
@@ -22,7 +22,7 @@ def opening(tree: TaskTree) -> tuple[jax.Array, jax.Array]:
 def myopia_regret(
     distances: jax.Array, labels: jax.Array, start: jax.Array, first: jax.Array, second: jax.Array
 ) -> jax.Array:
-    """Steps lost by going to the nearest place where ``first`` holds before the nearest from there where ``second`` does.
+    """Steps lost by nearest-first: to the nearest place of ``first``, from there to the nearest of ``second``.
 
     Among equally near places the worst counts, and nothing is avoided: this ranks layouts, it does not solve
     them (``hrlspec.solver`` does).

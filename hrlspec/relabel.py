@@ -232,7 +232,7 @@ def _grow(
 
 
 def _random_avoid(noise: jax.Array, forbidden: jax.Array, max_avoid: int) -> jax.Array:
-    """A random set of at most ``max_avoid`` (and P - 2) propositions outside ``forbidden``, bool ``[P]``; uniform size."""
+    """At most ``max_avoid`` (and P - 2) random propositions outside ``forbidden``, bool ``[P]``; uniform size."""
     num_propositions = forbidden.shape[0]
     most = max(0, min(max_avoid, num_propositions - 2))
     size = jnp.floor(noise[-1] * (most + 1)).astype(jnp.int32)

@@ -206,7 +206,7 @@ def controller_loss(
     on_policy, valid = flat(batch.on_policy), flat(batch.valid)
     advantage = ppo.normalise(flat(batch.advantage), on_policy)
     policy = ppo.policy_loss(log_prob, flat(batch.log_prob), advantage, on_policy, settings.clip)
-    value_loss = ppo.masked_mean((value - flat(batch.target)) ** 2, valid)
+    value_loss = ppo.value_loss(value, flat(batch.target), valid, settings.expectile)
     randomness = ppo.masked_mean(ppo.entropy(logits), on_policy)
     loss = policy + settings.value_coefficient * value_loss - entropy_weight * randomness
     return loss, {"policy_loss": policy, "value_loss": value_loss, "entropy": randomness}
@@ -224,7 +224,7 @@ def planner_loss(
     log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), batch.edge[:, None], 1)[:, 0]
     advantage = ppo.normalise(batch.advantage, batch.valid)
     policy = ppo.policy_loss(log_prob, batch.log_prob, advantage, batch.valid, settings.clip)
-    value_loss = ppo.masked_mean((value - batch.target) ** 2, batch.valid)
+    value_loss = ppo.value_loss(value, batch.target, batch.valid, settings.expectile)
     randomness = ppo.masked_mean(ppo.entropy(logits), batch.valid)
     loss = policy + settings.value_coefficient * value_loss - entropy_weight * randomness
     metrics = {"policy_loss": policy, "value_loss": value_loss, "entropy": randomness}

@@ -1,0 +1,1 @@
+"""Networks of both levels, as flax modules written for one unbatched item."""
