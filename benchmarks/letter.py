@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import importlib.metadata
 import json
 import os
 import platform
@@ -26,7 +27,6 @@ prepare()
 
 import jax
 import jax.numpy as jnp
-import jaxlib
 import numpy as np
 import tyro
 
@@ -156,7 +156,7 @@ def main() -> None:
     report: dict[str, Any] = {
         "benchmark": "letter",
         "env": flags.env,
-        "versions": {"python": platform.python_version(), "jax": jax.__version__, "jaxlib": jaxlib.__version__},
+        "versions": {"python": platform.python_version(), "jax": jax.__version__, "jaxlib": importlib.metadata.version("jaxlib")},
         "device": jax.devices()[0].device_kind,
         "cores": os.cpu_count(),
         "xla_flags": os.environ.get("XLA_FLAGS", ""),

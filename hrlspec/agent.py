@@ -19,6 +19,7 @@ from hrlspec.config import Config
 from hrlspec.networks.controller import Controller, Instruction
 from hrlspec.networks.planner import Planner
 from hrlspec.networks.reach_critic import ReachCritic
+from hrlspec.networks.tree import routes
 from hrlspec.spec import TaskState, TaskTree, initial, open_edges
 
 View = tuple[jax.Array, jax.Array]
@@ -97,25 +98,47 @@ class Agent:
         """Prepares tasks (leading axis M) for acting."""
         return TaskBook(tree=trees, told=jax.vmap(self.instruct, in_axes=(None, 0))(params, trees))
 
-    def plan(
+    def plan(self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction) -> Estimate:
+        """The planner on one environment: logits over edges ``[N]`` and the value of the remaining task ``[]``."""
+        return self.plan_ahead(params, view, tree, state, told)[:2]
+
+    def plan_ahead(
+        self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """As :meth:`plan`, and what the low level is told to look ahead to after each edge, ``[N, D, P]``."""
+        if self.config.network.advice:
+            advice, ahead = self.advise(params, view, tree, state, told)
+        else:
+            advice, ahead = jnp.zeros(tree.num_nodes), told.ahead
+        logits, value = cast(Estimate, self.planner.apply(params["planner"], view, tree, state, advice))
+        return logits, value, ahead
+
+    def advise(
         self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
     ) -> tuple[jax.Array, jax.Array]:
-        """The planner on one environment: logits over edges ``[N]`` and the value of the remaining task ``[]``."""
-        advice = jnp.zeros(tree.num_nodes)
-        if self.config.network.advice:
-            advice = self.advise(params, view, told, open_edges(tree, state))
-        return cast(Estimate, self.planner.apply(params["planner"], view, tree, state, advice))
+        """The low level's advice: its value of each feasible edge, followed by the best way on to a leaf.
 
-    def advise(self, params: Params, view: View, told: Instruction, feasible: jax.Array) -> jax.Array:
-        """The low level's value of the feasible edges' sub-tasks, ``[N]``; without gradient."""
-        num_nodes = feasible.shape[0]
-        size = min(self.config.network.advised, num_nodes)
-        edges = jnp.nonzero(feasible, size=size, fill_value=num_nodes)[0]
-        some = jax.tree.map(lambda x: x[jnp.minimum(edges, num_nodes - 1)], told)
+        Every way from the current node to a leaf is a sequence of sub-tasks, which the low level's critic values
+        much better than a tree.
+
+        Returns:
+            Values of edges ``[N]``, without gradient, and what lies ahead on each edge's best way, ``[N, D, P]``.
+        """
+        num_nodes = tree.num_nodes
+        way = routes(tree, state.node, 1 + told.ahead.shape[1])
+        leads = tree.accepting & (way[:, 0] >= 0) & open_edges(tree, state)[way[:, 0]]
+        leaf = jnp.nonzero(leads, size=min(self.config.network.advised, num_nodes), fill_value=num_nodes)[0]
+        known, way = leaf < num_nodes, way[jnp.minimum(leaf, num_nodes - 1)]
+        edge, later = way[:, 0], way[:, 1:]
+        ahead = tree.reach[later] & (later >= 0)[..., None] & self.config.future_embedding
+        some = dataclasses.replace(jax.tree.map(lambda x: x[edge], told), ahead=ahead.astype(jnp.float32))
         values = jax.vmap(self.control, in_axes=(None, None, 0))(params, view, some)[1]
-        worst = jnp.where(edges < num_nodes, values, jnp.inf).min()
-        worst = jnp.where(feasible.any(), worst, 0.0)
-        return jax.lax.stop_gradient(jnp.full(num_nodes, worst).at[edges].set(values, mode="drop"))
+        mine = (edge == jnp.arange(num_nodes)[:, None]) & known
+        score = jnp.where(mine, values, -jnp.inf)
+        worst = jnp.where(known.any(), jnp.where(known, values, jnp.inf).min(), 0.0)
+        advice = jnp.where(mine.any(1), score.max(1), worst)
+        best = some.ahead[score.argmax(1)]
+        return jax.lax.stop_gradient(advice), jnp.where(mine.any(1)[:, None, None], best, told.ahead)
 
     def control(self, params: Params, view: View, told: Instruction) -> tuple[jax.Array, jax.Array]:
         """The low level on one environment: action logits ``[A]`` and value ``[]``."""

@@ -32,6 +32,7 @@ class LowBatch:
     view: View
     slot: jax.Array  # int32, which of the trees
     edge: jax.Array  # int32, the assigned edge
+    ahead: jax.Array  # float32 [..., D, P], what was to be reached after it
     action: jax.Array  # int32
     log_prob: jax.Array  # float32, at the start of the update, under this task
     advantage: jax.Array  # float32
@@ -95,6 +96,7 @@ class _Experience:
     node: jax.Array
     blocked: jax.Array
     edge: jax.Array
+    ahead: jax.Array
     action: jax.Array
     log_prob: jax.Array
     value: jax.Array
@@ -125,6 +127,7 @@ def _originals(config: Config, book: TaskBook, rollout: Trajectory, num_slots: i
         node=rollout.node,
         blocked=rollout.blocked,
         edge=rollout.assigned,
+        ahead=rollout.ahead,
         action=rollout.action,
         log_prob=rollout.log_prob,
         value=rollout.value,
@@ -186,6 +189,12 @@ def _copies(
     edge = new.assigned.reshape(-1)
     view = jax.tree.map(lambda x: x.reshape((copies * num_steps, *x.shape[2:])), rollout.view)
     told = jax.tree.map(lambda x: x[row, edge], fresh.told)
+    if config.network.advice and config.future_embedding:
+        # The plan of a relabelled task is the path that was completed; its nodes follow one another.
+        later = edge[:, None] + 1 + jnp.arange(told.ahead.shape[1])
+        on_path = later <= new.path_length.reshape(-1)[row][:, None]
+        ahead = fresh.tree.reach[row[:, None], jnp.minimum(later, num_nodes - 1)] & on_path[..., None]
+        told = dataclasses.replace(told, ahead=ahead.astype(jnp.float32))
     logits, value = jax.vmap(agent.control, in_axes=(None, 0, 0))(params, view, told)
     log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), rollout.action.reshape(-1, 1), 1)[:, 0]
 
@@ -211,6 +220,7 @@ def _copies(
         node=new.node,
         blocked=jnp.zeros((copies, num_steps, num_nodes), bool),
         edge=new.assigned,
+        ahead=shaped(told.ahead),
         action=rollout.action,
         log_prob=shaped(log_prob),
         value=shaped(value),
@@ -254,6 +264,7 @@ def _with_targets(key: jax.Array, config: Config, x: _Experience) -> tuple[LowBa
         view=x.view,
         slot=x.slot,
         edge=x.edge,
+        ahead=x.ahead,
         action=x.action,
         log_prob=x.log_prob,
         advantage=target - x.value,

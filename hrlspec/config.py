@@ -47,8 +47,8 @@ class NetworkConfig:
     advice: float = 0.0
     """Weight of the low level's value of each candidate sub-task in the planner's logits (gradient stopped); the
     planner learns a correction to it. 0: the planner judges alone, as in the paper."""
-    advised: int = 6
-    """Candidates that get advice of their own; further ones count as the worst of these."""
+    advised: int = 12
+    """Ways to a leaf that are valued for the advice; edges without one count as the worst of these."""
 
 
 @dataclasses.dataclass(frozen=True)

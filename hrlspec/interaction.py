@@ -30,6 +30,7 @@ class Worker:
         task: int32 ``[E]``, row of the task book.
         task_state: where the task stands.
         assigned: int32 ``[E]``, the edge the planner assigned.
+        ahead: float32 ``[E, D, P]``, what the planner means to reach after it, see `Instruction`.
         awaiting: bool ``[E]``, a decision is due before the next action.
         rules: int32 ``[E, R]``, state of the bonus rules.
     """
@@ -39,6 +40,7 @@ class Worker:
     task: jax.Array
     task_state: TaskState
     assigned: jax.Array
+    ahead: jax.Array
     awaiting: jax.Array
     rules: jax.Array
 
@@ -82,6 +84,7 @@ def start(
         task=tasks,
         task_state=jax.vmap(initial)(task_of(book, tasks)),
         assigned=jnp.full(num_envs, TaskTree.NO_NODE, jnp.int32),
+        ahead=jnp.zeros((num_envs, *book.told.ahead.shape[2:])),
         awaiting=jnp.ones(num_envs, bool),
         rules=jnp.broadcast_to(rewards.initial(machine), (num_envs, machine.num_rules)),
     )
@@ -89,8 +92,10 @@ def start(
 
 def plan_where(
     agent: Agent, params: Params, book: TaskBook, worker: Worker, needed: jax.Array, noise: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Runs the planner for the environments in ``needed`` alone: choices, log-probabilities and values, ``[E]`` each.
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Runs the planner for the environments in ``needed`` alone.
+
+    Returns choices ``[E]``, what lies ahead of them ``[E, D, P]``, log-probabilities and values ``[E]``.
 
     Args:
         agent: the networks.
@@ -101,24 +106,25 @@ def plan_where(
         noise: Gumbel noise ``[E, N]``; zeros choose greedily.
     """
 
-    def decide(inputs: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def decide(inputs: Any) -> tuple[jax.Array, ...]:
         view, task, state, noise = inputs
         tree, told = jax.tree.map(lambda x: x[task], (book.tree, book.told))
-        logits, value = jax.vmap(agent.plan, in_axes=(None, 0, 0, 0, 0))(params, view, tree, state, told)
+        logits, value, ahead = jax.vmap(agent.plan_ahead, in_axes=(None, 0, 0, 0, 0))(params, view, tree, state, told)
         choice, log_prob = jax.vmap(sample)(logits, noise)
-        return choice, log_prob, value
+        return choice, ahead[jnp.arange(choice.shape[0]), choice], log_prob, value
 
     nothing = jnp.zeros(needed.shape)
-    outputs = (worker.assigned, nothing, nothing)
+    outputs = (worker.assigned, worker.ahead, nothing, nothing)
     inputs = (worker.view, worker.task, worker.task_state, noise)
     return in_groups(decide, needed, inputs, outputs, agent.config.group)
 
 
 def decide(agent: Agent, params: Params, book: TaskBook, worker: Worker, noise: jax.Array) -> tuple[Worker, Decision]:
     """Assigns a sub-task wherever one is due."""
-    choice, log_prob, value = plan_where(agent, params, book, worker, worker.awaiting, noise)
+    choice, ahead, log_prob, value = plan_where(agent, params, book, worker, worker.awaiting, noise)
     decision = Decision(made=worker.awaiting, log_prob=log_prob, value=value)
-    return dataclasses.replace(worker, assigned=choice, awaiting=jnp.zeros_like(worker.awaiting)), decision
+    awaiting = jnp.zeros_like(worker.awaiting)
+    return dataclasses.replace(worker, assigned=choice, ahead=ahead, awaiting=awaiting), decision
 
 
 def act(
@@ -138,7 +144,7 @@ def act(
         return safe, log_prob, value, safe != action
 
     told = jax.tree.map(lambda x: x[worker.task, worker.assigned], book.told)
-    return jax.vmap(one)(worker.view, told, noise)
+    return jax.vmap(one)(worker.view, dataclasses.replace(told, ahead=worker.ahead), noise)
 
 
 def transition(

@@ -45,7 +45,8 @@ class Relabelled:
     """The same rollout as a record of other tasks.
 
     Attributes:
-        tree: the new tasks, leading axis S.
+        tree: the new tasks, leading axis S; nodes 1, 2, ... are the completed path.
+        path_length: int32 ``[S]``, sub-tasks on that path.
         node: int32 ``[T]``, node of the new task before the step.
         assigned: int32 ``[T]``, the edge pursued: the next one of the path.
         decided: bool ``[T]``, a decision is due before the step.
@@ -55,6 +56,7 @@ class Relabelled:
     """
 
     tree: TaskTree
+    path_length: jax.Array
     node: jax.Array
     assigned: jax.Array
     decided: jax.Array
@@ -114,6 +116,7 @@ def relabel(
     reward = jax.lax.scan(pay, rewards.initial(machine), steps)[1]
     return Relabelled(
         tree=tree,
+        path_length=length,
         node=jnp.where(valid, done_before, 0),
         assigned=jnp.where(valid, done_before + 1, 0),
         decided=decided,

@@ -29,6 +29,7 @@ class Trajectory:
     node: jax.Array  # int32, task node before
     blocked: jax.Array  # bool [..., N], blocked edges before
     assigned: jax.Array  # int32, edge pursued
+    ahead: jax.Array  # float32 [..., D, P], what the planner meant to reach after it
     decided: jax.Array  # bool, the planner decided before
     plan_log_prob: jax.Array  # float32, where decided
     plan_value: jax.Array  # float32, where decided
@@ -150,7 +151,7 @@ def collect(
         both = jax.tree.map(lambda *x: jnp.concatenate(x), after, worker)
         needed = jnp.concatenate([after.awaiting, outcome.truncated])
         plan_noise = jnp.concatenate([plan_noise, jnp.zeros_like(plan_noise)])
-        choice, plan_log_prob, plan_value = plan_where(agent, params, book, both, needed, plan_noise)
+        choice, ahead, plan_log_prob, plan_value = plan_where(agent, params, book, both, needed, plan_noise)
         record = Trajectory(
             view=before.view,
             task=before.task,
@@ -158,6 +159,7 @@ def collect(
             node=before.task_state.node,
             blocked=before.task_state.blocked,
             assigned=before.assigned,
+            ahead=before.ahead,
             decided=decision.made,
             plan_log_prob=decision.log_prob,
             plan_value=decision.value,
@@ -177,7 +179,9 @@ def collect(
             level=collector.level,
         )
         collector = Collector(
-            worker=dataclasses.replace(after, assigned=choice[:num_envs], awaiting=jnp.zeros(num_envs, bool)),
+            worker=dataclasses.replace(
+                after, assigned=choice[:num_envs], ahead=ahead[:num_envs], awaiting=jnp.zeros(num_envs, bool)
+            ),
             decision=Decision(after.awaiting, plan_log_prob[:num_envs], plan_value[:num_envs]),
             level=jnp.where(ended, fresh.level, collector.level),
             started=started,
@@ -190,7 +194,7 @@ def collect(
     worker = collector.worker
     low = act(agent, params, book, worker, jnp.zeros((num_envs, agent.num_actions)), shield=False)[2]
     noise = jnp.zeros((num_envs, num_nodes))
-    high = plan_where(agent, params, book, worker, jnp.ones(num_envs, bool), noise)[2]
+    high = plan_where(agent, params, book, worker, jnp.ones(num_envs, bool), noise)[3]
     cut = trajectory.truncated[-1]
     return collector, dataclasses.replace(
         trajectory,

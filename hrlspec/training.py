@@ -23,7 +23,7 @@ from hrlspec.curriculum import Curriculum
 from hrlspec.interaction import Decision, start
 from hrlspec.rewards import RewardMachine
 from hrlspec.rollout import Collector, Trajectory, collect, fill_pool
-from hrlspec.spec import TaskState, TaskTree, open_edges
+from hrlspec.spec import TaskState, TaskTree
 
 Metrics = dict[str, jax.Array]
 
@@ -200,7 +200,7 @@ def controller_loss(
     told = jax.vmap(jax.vmap(agent.instruct, in_axes=(None, 0)), in_axes=(None, 0))(own, batch.tree)
     row = jnp.arange(batch.slot.shape[0])[:, None]
     told = jax.tree.map(lambda x: x[row, batch.slot, batch.edge], told)
-    view, told = jax.tree.map(flat, (batch.view, told))
+    view, told = jax.tree.map(flat, (batch.view, dataclasses.replace(told, ahead=batch.ahead)))
     logits, value = jax.vmap(agent.control, in_axes=(None, 0, 0))(own, view, told)
     log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), flat(batch.action)[:, None], 1)[:, 0]
     on_policy, valid = flat(batch.on_policy), flat(batch.valid)
@@ -290,7 +290,7 @@ def _advice(agent: Agent, params: Params, batch: PlanBatch) -> jax.Array:
     """The low level's advice on each decision, ``[B, N]``, at the start of the update."""
 
     def one(view: Any, tree: TaskTree, state: TaskState) -> jax.Array:
-        return agent.advise(params, view, agent.instruct(params, tree), open_edges(tree, state))
+        return agent.advise(params, view, tree, state, agent.instruct(params, tree))[0]
 
     return jax.vmap(one)(batch.view, batch.tree, plan_state(batch))
 

@@ -49,6 +49,26 @@ def lookahead(tree: TaskTree, depth: int) -> jax.Array:
     return jnp.stack(ahead, 1) if ahead else jnp.zeros((tree.num_nodes, 0, tree.num_propositions), bool)
 
 
+def routes(tree: TaskTree, node: jax.Array, length: int) -> jax.Array:
+    """The way from ``node`` to every node below it: its first ``length`` nodes, int32 ``[N, length]``.
+
+    ``NO_NODE`` stands where the way has ended, and everywhere for nodes that are not below.
+    """
+    place = jnp.arange(length)
+    nothing = jnp.full((tree.num_nodes, length), TaskTree.NO_NODE, jnp.int32)
+
+    def climb(_: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        here, way = carry
+        steps = tree.depth[here] - tree.depth[node] - 1
+        way = jnp.where(place == steps[:, None], here[:, None], way)
+        return jnp.where(tree.parent[here] >= 0, tree.parent[here], here), way
+
+    start = jnp.arange(tree.num_nodes, dtype=jnp.int32)
+    _, way = jax.lax.fori_loop(0, tree.num_nodes, climb, (start, nothing))
+    below = tree.valid & (tree.parent[way[:, 0]] == node) & (way[:, 0] >= 0)
+    return jnp.where(below[:, None], way, TaskTree.NO_NODE)
+
+
 class TaskEmbedding(nn.Module):
     """GCN over a task tree with zero node features and only p₊ on the edges (paper, "DAG Processing").
 
