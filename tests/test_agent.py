@@ -13,7 +13,7 @@ import pytest
 from hrlspec.agent import Agent, in_groups, sample, shielded_action
 from hrlspec.config import ShieldConfig
 from hrlspec.spec import TaskTree
-from tests.probes import Corridor, on_device, pairs, random_params, small_config
+from tests.probes import Corridor, on_device, pairs, quick_jit, random_params, small_config
 from tests.tasks import random_tree
 
 P, A = 5, 4
@@ -74,7 +74,7 @@ def test_shield_follows_its_rule(mode: str) -> None:
         agent = SimpleNamespace(config=SimpleNamespace(shield=ShieldConfig(mode=mode)), reach_values=lambda *_: q)
         return shielded_action(agent, {}, (q, q), avoid, action)
 
-    compiled = jax.jit(jax.vmap(act))
+    compiled = quick_jit(jax.vmap(act))
     q, avoid, action = rng.random((500, P, A)) ** 0.3, rng.random((500, P)) < 0.3, rng.integers(A, size=500)
     result = compiled(q.astype(np.float32), avoid, action)
     assert result.dtype == jnp.int32
@@ -98,8 +98,8 @@ def trees() -> TaskTree:
 
 def test_the_book_holds_each_sub_tasks_avoid_set(agent: Agent, trees: TaskTree) -> None:
     params = random_params(agent, 0)
-    book = jax.jit(agent.open_book)(params, trees)
-    instruct = jax.jit(agent.instruct)
+    book = quick_jit(agent.open_book)(params, trees)
+    instruct = quick_jit(agent.instruct)
     for m in range(20):
         tree = jax.tree.map(lambda x, m=m: x[m], trees)
         alone = instruct(params, tree)
@@ -116,7 +116,7 @@ def test_myopic_low_sees_nothing_of_the_future(trees: TaskTree) -> None:
     agent, sighted = Agent(Corridor(), small_config(future_embedding=False)), Agent(Corridor(), small_config())
     params = random_params(agent, 0)
     for name, told in (
-        ("myopic", agent.open_book(params, trees).told),
+        ("myopic", quick_jit(agent.open_book)(params, trees).told),
         ("ours", sighted.open_book(params, trees).told),
     ):
         assert np.asarray(told.reach).any()

@@ -19,7 +19,17 @@ from hrlspec.networks.controller import Instruction
 from hrlspec.networks.encoder import patches
 from hrlspec.networks.planner import MASKED
 from hrlspec.spec import TaskState, TaskTree, initial, open_edges
-from tests.probes import Corridor, on_device, padded, random_order, random_params, reordered, small_config, subtree
+from tests.probes import (
+    Corridor,
+    on_device,
+    padded,
+    quick_jit,
+    random_order,
+    random_params,
+    reordered,
+    small_config,
+    subtree,
+)
 from tests.tasks import random_tree, tree_of
 
 ENV = Corridor()
@@ -45,7 +55,7 @@ def compiled(rounds: int) -> tuple[Any, Any]:
     def plan(view: Any, tree: TaskTree, state: TaskState) -> Any:
         return agent.planner.apply(params["planner"], view, tree, state, jnp.zeros(tree.num_nodes))
 
-    return jax.jit(plan), jax.jit(functools.partial(agent.instruct, params))
+    return quick_jit(plan), quick_jit(functools.partial(agent.instruct, params))
 
 
 def plan(rounds: int, tree: TaskTree, *, node: int = 0, blocked: tuple[int, ...] = (), view: Any = VIEW) -> Any:
@@ -211,7 +221,7 @@ def test_gradients_are_finite(rounds: int, extras: bool) -> None:
             total += jax.vmap(one)(trees, state, book.told).sum()
         return total + agent.reach_values(params, VIEW).sum()
 
-    value, gradient = jax.jit(jax.value_and_grad(loss))(params)
+    value, gradient = quick_jit(jax.value_and_grad(loss))(params)
     assert np.isfinite(value)
     for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
         assert np.isfinite(leaf).all(), jax.tree_util.keystr(path)

@@ -17,7 +17,7 @@ import pytest
 from hrlspec.relabel import Record, Relabelled, branch_lengths, relabel
 from hrlspec.rewards import Bonus, reward_machine
 from hrlspec.spec import SATISFIED, TaskState, TaskTree, advance, initial, sample_trees, task_hashes
-from tests.probes import pairs, read_monitor
+from tests.probes import pairs, quick_jit, read_monitor
 from tests.tasks import random_tree
 from tests.test_rewards import reference
 
@@ -85,7 +85,7 @@ def relabeller(setting: Setting) -> Any:
             branch=branch,
         )
 
-    return jax.jit(jax.vmap(one, in_axes=(0, 0, None, None)))
+    return quick_jit(jax.vmap(one, in_axes=(0, 0, None, None)))
 
 
 @functools.cache
@@ -172,7 +172,7 @@ def test_the_jitted_monitor_agrees(setting: Setting) -> None:
         start = initial(jax.tree.map(lambda a: a[0], trees)), jnp.int32(-1)
         return jax.lax.scan(step, start, (slot, labels, assigned))[1]
 
-    before, after, status = jax.jit(jax.vmap(replay))(new.tree, record.slot, record.labels, new.assigned)
+    before, after, status = quick_jit(jax.vmap(replay))(new.tree, record.slot, record.labels, new.assigned)
     valid = new.valid
     np.testing.assert_array_equal(np.asarray(before)[valid], new.node[valid])
     np.testing.assert_array_equal((np.asarray(after) != before)[valid], record.edge_taken[valid])

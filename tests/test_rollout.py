@@ -17,10 +17,9 @@ from hrlspec.config import CurriculumConfig, RelabelConfig, ShieldConfig
 from hrlspec.curriculum import draw_bank
 from hrlspec.interaction import decide, start
 from hrlspec.rewards import Bonus, RewardMachine, reward_machine
-from hrlspec.rollout import Collector, Trajectory, collect
+from hrlspec.rollout import Collector, Trajectory, collect, fill_pool
 from hrlspec.spec import TaskState, TaskTree
-from hrlspec.training import Trainer
-from tests.probes import Corridor, pairs, random_params, read_monitor, small_config
+from tests.probes import Corridor, pairs, quick_jit, random_params, read_monitor, small_config
 from tests.test_agent import read_shield
 from tests.test_rewards import reference as read_rewards
 from tests.test_targets import low_reference, plan_reference
@@ -28,9 +27,10 @@ from tests.test_targets import low_reference, plan_reference
 # Letters everywhere, two of them together, and a short horizon: many episodes that end in every way.
 ENV = Corridor(cells=("a", "", "bc", "", "d", "", ""), starts=(1, 3, 5), horizon=9)
 CONFIG = small_config(
+    num_steps=48,
     curriculum=CurriculumConfig(levels=3, tasks_per_level=32, max_nodes=8, tree_share=0.5),
-    shield=ShieldConfig(threshold=0.6),
-    relabel=RelabelConfig(share=0.5),
+    shield=ShieldConfig(threshold=0.75),
+    relabel=RelabelConfig(share=1.0),
     unfinished=True,
 )
 AGENT = Agent(ENV, CONFIG)
@@ -48,7 +48,7 @@ class Rollout(NamedTuple):
     after: Collector
 
 
-@jax.jit
+@quick_jit
 def prepare(params: Any, bank: TaskTree, key: jax.Array) -> tuple[TaskBook, Collector]:
     tasks = jax.tree.map(lambda x: x[:E], bank)
     book = AGENT.open_book(params, jax.tree.map(lambda *x: jnp.concatenate(x), tasks, bank))
@@ -59,11 +59,11 @@ def prepare(params: Any, bank: TaskTree, key: jax.Array) -> tuple[TaskBook, Coll
     return book, Collector(worker=worker, decision=decision, level=zeros, started=zeros)
 
 
-@jax.jit
+@quick_jit
 def roll(params: Any, book: TaskBook, collector: Collector, key: jax.Array) -> Rollout:
     keys = jax.random.split(key, 3)
-    pool = Trainer(AGENT)._pool(keys[0])
-    after, trajectory = collect(keys[1], AGENT, params, machine(), book, collector, pool, jnp.int32(LEVEL))
+    pool = fill_pool(keys[0], AGENT, book, jnp.int32(LEVEL), size=12)
+    after, trajectory = collect(keys[1], AGENT, params, machine(), book, collector, pool)
     low, plan = build(keys[2], AGENT, params, machine(), book, trajectory, jnp.zeros(1, jnp.uint32))
     return Rollout(trajectory, low, plan, after)
 
@@ -114,7 +114,7 @@ def test_the_sample_is_rich(t: Trajectory) -> None:
     assert t.shielded.mean() < 0.5
     assert (t.labels.sum(-1) > 1).any()
     assert t.blocked.any()
-    assert t.reward.max() >= 5
+    assert rollouts()[1].trajectory.reward.max() >= 5
     assert t.decided[0].any()
     assert not t.decided[0].all()
     assert set(t.level.ravel()) == {0, 1, 2}
@@ -197,12 +197,12 @@ def flat(x: Any) -> Any:
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), x)
 
 
-@jax.jit
+@quick_jit
 def control(params: Any, view: Any, told: Any) -> Any:
     return jax.vmap(AGENT.control, (None, 0, 0))(params, view, told)
 
 
-@jax.jit
+@quick_jit
 def plan_all(params: Any, view: Any, tree: TaskTree, state: TaskState) -> Any:
     told = jax.vmap(AGENT.instruct, (None, 0))(params, tree)
     return jax.vmap(AGENT.plan, (None, 0, 0, 0, 0))(params, view, tree, state, told)
@@ -218,13 +218,13 @@ def test_actions_values_and_the_shield(book: TaskBook, t: Trajectory) -> None:
     own = ~t.shielded.ravel()
     np.testing.assert_allclose(t.log_prob.ravel()[own], log_probs(logits, t.action.ravel())[own], atol=1e-5)
     np.testing.assert_allclose(t.value.ravel(), value, atol=1e-5)
-    q = np.asarray(jax.jit(jax.vmap(AGENT.reach_values, (None, 0)))(params(), flat(t.view)))
+    q = np.asarray(quick_jit(jax.vmap(AGENT.reach_values, (None, 0)))(params(), flat(t.view)))
     for i in range(T * E):
         forbidden, action = pairs(told.avoid[i]), int(t.action.ravel()[i])
         shielded = t.shielded.ravel()[i]
         # Of two actions the shield replaced the other one; an action that stands is one that the rule lets stand.
         meant = 1 - action if shielded else action
-        assert read_shield("state", 0.6, q[i], forbidden, meant) == action
+        assert read_shield("state", CONFIG.shield.threshold, q[i], forbidden, meant) == action
         if shielded:
             np.testing.assert_allclose(
                 t.log_prob.ravel()[i], log_probs(logits[i][None], np.array([meant]))[0], atol=1e-5
@@ -286,7 +286,7 @@ def test_targets_of_the_originals_equal_the_reference(t: Trajectory) -> None:
     np.testing.assert_array_equal(low.on_policy[:E], valid & ~t.shielded.T)
 
 
-@jax.jit
+@quick_jit
 def low_log_probs(params: Any, low: LowBatch) -> jax.Array:
     told = jax.vmap(jax.vmap(AGENT.instruct, (None, 0)), (None, 0))(params, low.tree)
     row = jnp.arange(low.slot.shape[0])[:, None]
@@ -302,7 +302,7 @@ def test_ratios_are_one_at_the_start_of_the_update() -> None:
     now = np.asarray(low_log_probs(params(), low))
     np.testing.assert_allclose(now[low.on_policy], low.log_prob[low.on_policy], atol=1e-5)
     assert low.on_policy[E:].sum() > 30
-    assert low.valid.shape == (E + E // 2, T)
+    assert low.valid.shape == (2 * E, T)
     logits, _ = plan_all(params(), plan.view, plan.tree, jax.tree.map(np.asarray, plan_state(plan)))
     recomputed = log_probs(logits, plan.edge)
     np.testing.assert_allclose(recomputed[plan.valid], plan.log_prob[plan.valid], atol=1e-5)
@@ -349,7 +349,7 @@ def test_without_unfinished_every_sample_was_completed() -> None:
     agent = Agent(ENV, config)
     bank = rollouts()[0]
 
-    @jax.jit
+    @quick_jit
     def rebuild(book: TaskBook, t: Trajectory) -> PlanBatch:
         return build(jax.random.key(0), agent, {}, machine(), book, t, jnp.zeros(1, jnp.uint32))[1]
 

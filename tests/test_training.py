@@ -19,7 +19,16 @@ from hrlspec.rewards import RewardMachine, reward_machine
 from hrlspec.rollout import Trajectory
 from hrlspec.spec import TaskTree, initial
 from hrlspec.training import Trainer, TrainState
-from tests.probes import Corridor, CorridorLayout, bank_of, on_device, probe_task, random_params, small_config
+from tests.probes import (
+    Corridor,
+    CorridorLayout,
+    bank_of,
+    on_device,
+    probe_task,
+    quick_jit,
+    random_params,
+    small_config,
+)
 
 # a at 0, b at 4, c at 6; episodes start at 1, 2 or 3.
 ENV = Corridor()
@@ -47,18 +56,16 @@ def machine(completion: float = 1.0) -> RewardMachine:
 
 
 def fresh(seed: int = 0) -> TrainState:
-    return TRAINER.init(jax.random.key(seed), bank(), machine())
+    return init(jax.random.key(seed), bank(), machine())
 
 
-def copy(state: Any) -> Any:
-    """The training iteration takes its argument's memory."""
-    return jax.tree.map(jnp.copy, state)
+init, step = quick_jit(TRAINER.init), quick_jit(TRAINER.iterate)
 
 
 def iterate(state: TrainState, times: int, completion: float = 1.0) -> tuple[TrainState, list[dict[str, float]]]:
     history = []
     for _ in range(times):
-        state, metrics = TRAINER.iterate(state, bank(), machine(completion), NOTHING_RESERVED)
+        state, metrics = step(state, bank(), machine(completion), NOTHING_RESERVED)
         history.append(metrics)
     return state, [{name: float(value) for name, value in metrics.items()} for metrics in history]
 
@@ -85,15 +92,15 @@ def test_training_goes_on_from_a_checkpoint_as_if_nothing_had_happened(tmp_path:
     checkpoint.save(tmp_path, 2, half)
     target = jax.eval_shape(TRAINER.init, jax.random.key(9), bank(), machine())
     restored = checkpoint.load(tmp_path, target).state
-    traces = TRAINER.iterate._cache_size()
+    traces = step._cache_size()
     resumed, _ = iterate(restored, 2)
     assert state_hash(resumed) == state_hash(straight)
-    assert TRAINER.iterate._cache_size() == traces
+    assert step._cache_size() == traces
 
 
 def test_nothing_compiles_again_across_levels() -> None:
     state, _ = iterate(fresh(), 1)
-    traces = TRAINER.iterate._cache_size()
+    traces = step._cache_size()
     ready = state.curriculum.replace(finished=jnp.int32(10_000), succeeded=jnp.int32(10_000))
     state, _ = iterate(state.replace(curriculum=ready), 1)
     assert int(state.curriculum.level) == 1
@@ -101,14 +108,13 @@ def test_nothing_compiles_again_across_levels() -> None:
     assert history[-1]["level"] == 2
     # The tasks of the new level have come in.
     assert np.asarray(state.tasks.depth).max() == 2
-    assert TRAINER.iterate._cache_size() == traces
+    assert step._cache_size() == traces
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_updates_that_are_not_finite_are_skipped_and_counted(bad: float) -> None:
-    before, _ = iterate(fresh(), 1)
-    kept = copy(before)
-    after, (metrics,) = iterate(before, 1, completion=bad)
+    kept, _ = iterate(fresh(), 1)
+    after, (metrics,) = iterate(kept, 1, completion=bad)
     assert metrics["successes"] > 0
     for name in ("controller", "planner"):
         assert metrics[f"{name}/skipped"] > 0
@@ -184,7 +190,7 @@ def planner_at(name: str) -> tuple[np.ndarray, np.ndarray]:
         logits, value = agent.plan(params, view, tree, initial(tree), agent.instruct(params, tree))
         return jax.nn.softmax(logits), value
 
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(ENV.view_at(np.array([1, 2, 3]))))
+    return jax.tree.map(np.asarray, quick_jit(jax.vmap(one))(ENV.view_at(np.array([1, 2, 3]))))
 
 
 def test_the_planner_picks_the_shorter_branch() -> None:
@@ -206,7 +212,7 @@ def test_the_planner_knows_the_values() -> None:
 def test_the_low_level_knows_the_values() -> None:
     params, agent, tree = trained()[0].params, TRAINER.agent, on_device(task("a; b"))
     told = jax.tree.map(lambda x: x[1], agent.instruct(params, tree))
-    _, values = jax.jit(jax.vmap(lambda view: agent.control(params, view, told)))(ENV.view_at(np.array([1, 2, 3])))
+    _, values = quick_jit(jax.vmap(lambda view: agent.control(params, view, told)))(ENV.view_at(np.array([1, 2, 3])))
     np.testing.assert_allclose(values, GAMMA ** np.array([4, 5, 6]), atol=0.12)
 
 
@@ -231,9 +237,9 @@ def test_the_reach_critic_learns_the_distance() -> None:
         flags = {"terminated": ended, "truncated": ended & False, "labels": ENV.table[np.stack(here[1:])]}
         return Trajectory(**{**blank, **flags, "action": action, "view": ENV.view_at(np.stack(here[:-1]))})
 
-    @jax.jit
+    @quick_jit
     def fit(params: Any, state: Any, walks: Trajectory) -> Any:
-        def step(carry: Any, trajectory: Trajectory) -> Any:
+        def fit_one(carry: Any, trajectory: Trajectory) -> Any:
             params, state = carry
             batch = training.reach_batch(agent, {"reach_critic": params}, trajectory)
 
@@ -243,7 +249,7 @@ def test_the_reach_critic_learns_the_distance() -> None:
             params, state, metrics = ppo.gradient_step(loss, params, state, transform, jnp.float32(0.01))
             return (params, state), metrics["value_loss"]
 
-        return jax.lax.scan(step, (params, state), walks)
+        return jax.lax.scan(fit_one, (params, state), walks)
 
     walks = jax.tree.map(lambda *x: np.stack(x), *[walk() for _ in range(600)])
     params = random_params(agent, 0)["reach_critic"]
