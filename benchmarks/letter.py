@@ -156,7 +156,11 @@ def main() -> None:
     report: dict[str, Any] = {
         "benchmark": "letter",
         "env": flags.env,
-        "versions": {"python": platform.python_version(), "jax": jax.__version__, "jaxlib": importlib.metadata.version("jaxlib")},
+        "versions": {
+            "python": platform.python_version(),
+            "jax": jax.__version__,
+            "jaxlib": importlib.metadata.version("jaxlib"),
+        },
         "device": jax.devices()[0].device_kind,
         "cores": os.cpu_count(),
         "xla_flags": os.environ.get("XLA_FLAGS", ""),

@@ -73,7 +73,9 @@ class Controller(nn.Module):
             # By role the encoder need not push the whole observation through its latent to find the goal afterwards.
             planes = jnp.tensordot(jnp.concatenate([told.reach[None], told.avoid[None], told.ahead]), planes, axes=1)
         latent = nn.relu(self.encoder(planes, shared))
-        x = jnp.concatenate([latent, told.reach, told.avoid, told.future])
+        # With the planner's advice there is a plan, and what remains is the rest of the plan.
+        future = self.task_embedding.of_way(told.ahead) if self.config.advice else told.future
+        x = jnp.concatenate([latent, told.reach, told.avoid, future])
         return self.actor(x), self.critic(x)[0]
 
     def everything(self, view: tuple[jax.Array, jax.Array], tree: TaskTree) -> tuple[jax.Array, jax.Array]:

@@ -9,6 +9,12 @@ import jax
 import jax.numpy as jnp
 
 
+def initializer(gain: float) -> nn.initializers.Initializer:
+    """Weights of a layer that scales its input by ``gain``."""
+    # Normal, not orthogonal: a QR decomposition per layer takes longer to compile than the rest of a run's start.
+    return nn.initializers.variance_scaling(gain**2, "fan_in", "truncated_normal")
+
+
 class MLP(nn.Module):
     """Dense layers with ReLU (or tanh) between them and, unless ``final_activation``, a linear end."""
 
@@ -23,7 +29,7 @@ class MLP(nn.Module):
         for i, width in enumerate(self.features):
             last = i == len(self.features) - 1
             gain = self.final_scale if last and self.final_scale is not None else 2.0**0.5
-            x = nn.Dense(width, kernel_init=nn.initializers.orthogonal(gain))(x)
+            x = nn.Dense(width, kernel_init=initializer(gain))(x)
             if not last or self.final_activation:
                 x = nn.tanh(x) if self.tanh else nn.relu(x)
         return x
@@ -65,8 +71,8 @@ class Encoder(nn.Module):
         if planes.ndim == 3 and self.conv_channels:
             x = jnp.moveaxis(planes, 0, -1)
             for width in self.conv_channels:
-                x = nn.relu(nn.Dense(width, kernel_init=nn.initializers.orthogonal(2.0**0.5))(patches(x)))
+                x = nn.relu(nn.Dense(width, kernel_init=initializer(2.0**0.5))(patches(x)))
             x = jnp.concatenate([x.reshape(-1), shared])
         else:
             x = MLP(self.mlp, final_activation=True)(jnp.concatenate([planes.reshape(-1), shared]))
-        return nn.Dense(self.latent, kernel_init=nn.initializers.orthogonal(1.0))(x)
+        return nn.Dense(self.latent, kernel_init=initializer(1.0))(x)

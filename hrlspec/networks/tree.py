@@ -83,23 +83,34 @@ class TaskEmbedding(nn.Module):
     features: int
     rounds: int
 
-    @nn.compact
+    def setup(self) -> None:
+        """Declares the weights: of a node's own features, and of the message along an edge."""
+        self.own = nn.Dense(self.features)
+        self.message = nn.Dense(self.features, use_bias=False)
+        self.edge = nn.Dense(self.features, use_bias=False)
+
     def __call__(self, tree: TaskTree) -> jax.Array:
         """Embeds all progressions of one task, float32 ``[N, F]``."""
         sends = tree.valid & (tree.parent >= 0)
-        own = nn.Dense(self.features)
-        message = nn.Dense(self.features, use_bias=False)
-        edge = nn.Dense(self.features, use_bias=False)(tree.reach.astype(jnp.float32))
+        edge = self.edge(tree.reach.astype(jnp.float32))
         x = jnp.zeros((tree.num_nodes, self.features))
         if not self.rounds:
-            bias = own(x[0])
+            bias = self.own(x[0])
 
-            def visit(module: nn.Module, incoming: jax.Array, node: jax.Array) -> tuple[jax.Array, jax.Array]:
+            def visit(module: TaskEmbedding, incoming: jax.Array, node: jax.Array) -> tuple[jax.Array, jax.Array]:
                 here = nn.tanh(bias + incoming[node])
-                sent = nn.tanh(message(here) + edge[node]) * sends[node]
+                sent = nn.tanh(module.message(here) + edge[node]) * sends[node]
                 return incoming.at[tree.parent[node]].add(sent), here
 
             return sweep_up(visit, self, x)
         for _ in range(self.rounds):
-            x = nn.tanh(own(x) + sum_to_parents(nn.tanh(message(x) + edge), tree.parent, sends))
+            x = nn.tanh(self.own(x) + sum_to_parents(nn.tanh(self.message(x) + edge), tree.parent, sends))
+        return x
+
+    def of_way(self, ahead: jax.Array) -> jax.Array:
+        """Embeds a sequence of sub-tasks as the sweep would, ``[F]``; p₊ is ``[D, P]``, empty rows after its end."""
+        bias = self.own(jnp.zeros(self.features))
+        x = nn.tanh(bias)
+        for reach in ahead[::-1]:
+            x = nn.tanh(bias + reach.any() * nn.tanh(self.message(x) + self.edge(reach)))
         return x
