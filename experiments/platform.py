@@ -5,8 +5,10 @@ XLA reads its flags when the first array is made, so this must come before that;
 
 from __future__ import annotations
 
+import ctypes
 import importlib.metadata
 import os
+import sys
 from pathlib import Path
 
 import jax
@@ -23,11 +25,26 @@ def prepare() -> None:
 
     What the user set in ``XLA_FLAGS``, ``JAX_COMPILATION_CACHE_DIR`` and JAX's other variables stays as it is.
     """
+    _keep_freed_memory()
     os.environ["XLA_FLAGS"] = with_loop_option(os.environ.get("XLA_FLAGS", ""), jax.__version_info__)
     if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def _keep_freed_memory() -> None:
+    """Tells glibc not to give large blocks back to the system.
+
+    XLA takes the same ones again in every iteration, and the kernel would map and clear each page anew.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # other C libraries lack it
+    if mallopt:
+        trim_threshold, mmap_threshold = -1, -3
+        mallopt(trim_threshold, 2**31 - 1)
+        mallopt(mmap_threshold, 2**30)
 
 
 def with_loop_option(flags: str, version: tuple[int, ...]) -> str:

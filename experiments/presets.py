@@ -44,7 +44,7 @@ def hrlspec() -> Config:
         max_operator=False,
         unfinished=True,
         low=PPOConfig(learning_rate=7e-4, epochs=2, minibatches=16, entropy=0.01, final_entropy=0.002),
-        high=PPOConfig(learning_rate=3e-4, epochs=2, minibatches=4, entropy=0.005, final_entropy=0.005),
+        high=PPOConfig(learning_rate=2e-4, epochs=2, minibatches=4, entropy=0.005, final_entropy=0.005),
         network=NetworkConfig(
             # Seen by role the grid needs no convolution: a third of the time, and no worse.
             conv_channels=(),
@@ -60,8 +60,8 @@ def hrlspec() -> Config:
             # The learned correction alone misleads: it is trained on relabelled paths, all of which succeeded.
             advice=200.0,
         ),
-        curriculum=CurriculumConfig(tree_share=0.5, earlier=0.4, contested=0.5),
-        relabel=RelabelConfig(share=0.25),
+        curriculum=CurriculumConfig(tree_share=0.5, earlier=0.4, contested=0.7),
+        relabel=RelabelConfig(share=0.25, planner_policy=False),
         # The policy learns to avoid by itself; shielded steps are lost to it.
         shield=ShieldConfig(mode="off"),
     )

@@ -58,6 +58,7 @@ class PlanBatch:
     completed: jax.Array  # bool, it was, within the episode
     advice: jax.Array  # float32 [B, N], the low level's values at the start of the update; zeros when not used
     valid: jax.Array  # bool
+    chosen: jax.Array  # bool, counts in the policy loss
 
 
 def build(
@@ -111,6 +112,7 @@ class _Experience:
     edge_taken: jax.Array
     reached: jax.Array
     on_policy: jax.Array
+    choice: jax.Array
     valid: jax.Array
 
 
@@ -142,6 +144,7 @@ def _originals(config: Config, book: TaskBook, rollout: Trajectory, num_slots: i
         edge_taken=rollout.edge_taken,
         reached=book.tree.reach[rollout.task, rollout.edge],
         on_policy=valid & ~rollout.shielded,
+        choice=jnp.ones_like(valid),
         valid=valid,
     )
 
@@ -235,6 +238,7 @@ def _copies(
         edge_taken=rollout.edge_taken & new.valid,
         reached=record.reach,
         on_policy=new.valid & ~rollout.shielded,
+        choice=jnp.full_like(new.valid, config.relabel.planner_policy),
         valid=new.valid,
     )
 
@@ -309,6 +313,7 @@ def _pick_decisions(
         completed=goes_on,
         advice=jnp.zeros((size, x.blocked.shape[-1])),
         valid=score >= 0,
+        chosen=(score >= 0) & x.choice[row, time],
     )
 
 

@@ -102,6 +102,9 @@ class RelabelConfig:
 
     share: float = 0.5
     """Share of the environments whose trajectories are trained on a second time, relabelled. 0 switches it off."""
+    planner_policy: bool = True
+    """Whether the planner's policy learns from the copies; its value and transition model always do. In a copy the
+    branch taken was not chosen by the planner, and always succeeded."""
     branch: float = 0.7
     """Probability of a random branch at each node of the completed path."""
 

@@ -21,6 +21,7 @@ from hrlspec.batch import LowBatch, PlanBatch, build, plan_state
 from hrlspec.config import PPOConfig
 from hrlspec.curriculum import Curriculum
 from hrlspec.interaction import Decision, start
+from hrlspec.networks.planner import MASKED
 from hrlspec.rewards import RewardMachine
 from hrlspec.rollout import Collector, Trajectory, collect, fill_pool
 from hrlspec.spec import TaskState, TaskTree
@@ -222,10 +223,12 @@ def planner_loss(
         params, batch.view, batch.tree, plan_state(batch), batch.advice
     )
     log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), batch.edge[:, None], 1)[:, 0]
-    advantage = ppo.normalise(batch.advantage, batch.valid)
-    policy = ppo.policy_loss(log_prob, batch.log_prob, advantage, batch.valid, settings.clip)
+    # Where only one edge is open there is nothing to learn, and the mean of the advantages is another one.
+    free = batch.chosen & ((logits > MASKED / 2).sum(-1) > 1)
+    advantage = ppo.normalise(batch.advantage, free)
+    policy = ppo.policy_loss(log_prob, batch.log_prob, advantage, free, settings.clip)
     value_loss = ppo.value_loss(value, batch.target, batch.valid, settings.expectile)
-    randomness = ppo.masked_mean(ppo.entropy(logits), batch.valid)
+    randomness = ppo.masked_mean(ppo.entropy(logits), free)
     loss = policy + settings.value_coefficient * value_loss - entropy_weight * randomness
     metrics = {"policy_loss": policy, "value_loss": value_loss, "entropy": randomness}
     if config.transe:
