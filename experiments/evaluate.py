@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from rich.console import Console
 
 from experiments import platform
 from experiments.command import parse_flags
@@ -22,7 +21,7 @@ from experiments.options import Experiment, environment_of, experiment_of
 from experiments.presets import rewards_of
 from experiments.run_folder import read_record
 from experiments.suites import load_suite
-from experiments.tables import suite_table
+from experiments.tables import result_console, suite_table
 from hrlspec import checkpoint
 from hrlspec.agent import Agent, Params
 from hrlspec.evaluation import Suite, evaluate_suite, suite_from_text
@@ -99,7 +98,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         facts: dict[str, Any] = {"run": str(flags.run), "checkpoint_step": step, "reward_set": experiment.reward_set}
         print(json.dumps({**facts, **result.to_json()}, allow_nan=False))
         return
-    console = Console()
+    console = result_console()
     console.print(suite_table(result))
     if 1 < len(suite) <= 20:
         for task in result.per_task:

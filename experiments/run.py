@@ -21,7 +21,7 @@ from experiments.loop import DivergedError, Loop
 from experiments.options import Experiment, RunFlags, experiment_of, experiments_of, parse_run
 from experiments.progress import ProgressDisplay, duration
 from experiments.run_folder import RunFolder, open_run, read_metrics, read_record, read_summary
-from experiments.tables import aggregate_table, final_tables
+from experiments.tables import aggregate_table, final_tables, result_console
 from hrlspec.evaluation import SuiteResult, aggregate
 
 
@@ -40,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     runs = experiments_of(flags)
     resumed = _check_folders(runs, flags)
     platform.prepare()
-    console = Console()
+    console = result_console()
     summaries = [
         _run(experiment, folder, resume, flags, console)
         for (experiment, folder), resume in zip(runs, resumed, strict=True)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from rich import box
+from rich.console import Console
 from rich.table import Table
 
 from experiments.learner import FinalResults
@@ -18,6 +19,12 @@ _NAMES = {
     "steps_mean": "steps",
     "spl": "SPL",
 }
+
+
+def result_console() -> Console:
+    """Standard output; where it is no terminal, wide enough for any table."""
+    console = Console()
+    return console if console.is_terminal else Console(width=100)
 
 
 def suite_table(result: SuiteResult) -> Table:
@@ -84,7 +91,7 @@ def aggregate_table(name: str, aggregates: Mapping[str, Aggregate]) -> Table:
 
 
 def _table(title: str, columns: Sequence[str], caption: str | None = None) -> Table:
-    table = Table(title=title, caption=caption, box=box.SIMPLE_HEAD)
+    table = Table(title=title, caption=caption, box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
     for i, column in enumerate(columns):
         table.add_column(column, justify="right" if i else "left", no_wrap=True)
     return table
