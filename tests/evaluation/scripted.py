@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,17 +10,10 @@ import numpy as np
 
 from envs_jax.letter import MOVES
 from hrlspec.agent import Agent, Params, View
+from hrlspec.networks.controller import Instruction
 from hrlspec.spec import TaskState, TaskTree, open_edges, subtask_avoid
 
 FAR = 1e4
-
-
-class Order(NamedTuple):
-    """What the walker is told of an edge: bool ``[P]`` each; ``following`` is what its first child reaches."""
-
-    reach: jax.Array
-    avoid: jax.Array
-    following: jax.Array
 
 
 def manner(*, look_ahead: bool = False, last: bool = False) -> Params:
@@ -40,31 +33,32 @@ class Walker(Agent):
     Its parameters, which change how it acts without compiling anything anew, come from :func:`manner`.
     """
 
-    def instruct(self, params: Params, tree: TaskTree) -> Any:
-        """The sub-task of every edge and what comes after it, leading axis N."""
+    def instruct(self, params: Params, tree: TaskTree) -> Instruction:
+        """The sub-task of every edge and what its first child reaches, leading axis N."""
         del params
         child = tree.parent[None, :] == jnp.arange(tree.num_nodes)[:, None]
         following = jnp.where(child.any(-1)[:, None], tree.reach[child.argmax(-1)], False)
-        return Order(tree.reach, subtask_avoid(tree), following)
+        reach, avoid, ahead = (x.astype(jnp.float32) for x in (tree.reach, subtask_avoid(tree), following[:, None]))
+        return Instruction(reach=reach, avoid=avoid, ahead=ahead, future=jnp.zeros((tree.num_nodes, 0)))
 
-    def plan(
-        self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Any
-    ) -> tuple[jax.Array, jax.Array]:
+    def plan_ahead(
+        self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """By index."""
-        del view, told
+        del view
         index = jnp.arange(tree.num_nodes)
         wish = jnp.where(params["last"], index, -index)
-        return jnp.where(open_edges(tree, state), wish.astype(jnp.float32), -FAR), jnp.float32(0)
+        return jnp.where(open_edges(tree, state), wish.astype(jnp.float32), -FAR), jnp.float32(0), told.ahead
 
-    def control(self, params: Params, view: View, told: Any) -> tuple[jax.Array, jax.Array]:
+    def control(self, params: Params, view: View, told: Instruction) -> tuple[jax.Array, jax.Array]:
         """Minus the steps that remain after each action."""
         planes = view[0] > 0  # bool [P, n, n], the agent in the middle cell
 
         def holds(wanted: jax.Array) -> jax.Array:
-            return (planes & wanted[:, None, None]).any(0)
+            return (planes & (wanted > 0)[:, None, None]).any(0)
 
-        after = _distance(jnp.where(holds(told.following), 0.0, FAR), jnp.zeros(planes.shape[1:], bool))
-        counts = params["look_ahead"] & told.following.any()
+        after = _distance(jnp.where(holds(told.ahead[0]), 0.0, FAR), jnp.zeros(planes.shape[1:], bool))
+        counts = params["look_ahead"] & told.ahead[0].any()
         ahead = _distance(jnp.where(holds(told.reach), jnp.where(counts, after, 0.0), FAR), holds(told.avoid))
         middle = planes.shape[-1] // 2
         rows, columns = (middle + np.array(MOVES)).T % planes.shape[-1]
