@@ -62,7 +62,7 @@ class Corridor(Environment):
     The layout is only the start, drawn from ``starts``: an observation tells position and letters, nothing else.
     """
 
-    cells: tuple[str, ...] = ("a", "", "", "", "b", "", "c")
+    cells: tuple[str, ...] = ("a", "", "", "", "b", "c")
     starts: tuple[int, ...] = (1, 2, 3)
     horizon: int = 12
     name: str = "corridor"
@@ -127,16 +127,16 @@ class Corridor(Environment):
 
 def small_config(**changes: Any) -> Config:
     """Every technique on, as small as it goes; compiled programs are shared by tests that change nothing."""
-    ppo = PPOConfig(learning_rate=5e-3, final_learning_rate=5e-3, epochs=2, minibatches=2)
+    ppo = PPOConfig(learning_rate=2e-3, final_learning_rate=0.0, epochs=4, minibatches=2)
     config = Config(
-        num_envs=16,
+        num_envs=32,
         num_steps=24,
-        total_steps=10**6,
+        total_steps=200 * 32 * 24,
         discount=0.9,
         planner_share=4,
         group=8,
-        low=dataclasses.replace(ppo, entropy=0.003, final_entropy=0.003),
-        high=dataclasses.replace(ppo, entropy=0.003, final_entropy=0.003),
+        low=dataclasses.replace(ppo, entropy=0.05, final_entropy=0.01),
+        high=dataclasses.replace(ppo, entropy=0.01, final_entropy=0.002),
         network=NetworkConfig(
             latent=16,
             conv_channels=(),
@@ -152,9 +152,9 @@ def small_config(**changes: Any) -> Config:
             reach_critic=(32,),
             roles=True,
         ),
-        curriculum=CurriculumConfig(levels=2, tasks_per_level=16, max_nodes=6, window=64),
-        relabel=RelabelConfig(),
-        shield=ShieldConfig(minibatches=2),
+        curriculum=CurriculumConfig(levels=2, tasks_per_level=32, max_nodes=6, window=64),
+        relabel=RelabelConfig(planner_policy=False),
+        shield=ShieldConfig(minibatches=4),
     )
     return dataclasses.replace(config, **changes)
 

@@ -27,9 +27,10 @@ from tests.test_targets import low_reference, plan_reference
 # Letters everywhere, two of them together, and a short horizon: many episodes that end in every way.
 ENV = Corridor(cells=("a", "", "bc", "", "d", "", ""), starts=(1, 3, 5), horizon=9)
 CONFIG = small_config(
+    network=dataclasses.replace(small_config().network, advice=1.0, advised=3),
     num_steps=48,
     curriculum=CurriculumConfig(levels=3, tasks_per_level=32, max_nodes=8, tree_share=0.5),
-    shield=ShieldConfig(threshold=0.75),
+    shield=ShieldConfig(threshold=0.6),
     relabel=RelabelConfig(share=1.0),
     unfinished=True,
 )
@@ -193,6 +194,26 @@ def test_decisions_where_they_are_due_and_only_there() -> None:
     assert 0.1 < due.mean() < 0.9
 
 
+def test_what_lies_ahead_is_a_way_to_a_leaf(book: TaskBook, t: Trajectory) -> None:
+    """Or, of an edge that was not advised on, everything that lies ahead; and it stays until the next decision."""
+    plans = 0
+    for s, e in np.ndindex(T, E):
+        tree, edge = tree_of_row(book, t.task[s, e]), t.assigned[s, e]
+        ways = []
+        for leaf in np.flatnonzero(tree.accepting):
+            way = [leaf]
+            while way[0] not in (0, edge):
+                way.insert(0, tree.parent[way[0]])
+            if way[0] == edge:
+                ways.append(np.array([*tree.reach[way[1:3]], *np.zeros((2, 4), bool)])[:2])
+        everything = np.asarray(book.told.ahead[t.task[s, e], edge], bool)
+        assert any((t.ahead[s, e] == way).all() for way in [*ways, everything])
+        plans += not (t.ahead[s, e] == everything).all()
+        if s and not t.decided[s, e]:
+            np.testing.assert_array_equal(t.ahead[s, e], t.ahead[s - 1, e])
+    assert plans > 0
+
+
 def flat(x: Any) -> Any:
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), x)
 
@@ -214,6 +235,7 @@ def log_probs(logits: Any, choice: np.ndarray) -> np.ndarray:
 
 def test_actions_values_and_the_shield(book: TaskBook, t: Trajectory) -> None:
     told = jax.tree.map(lambda x: x[t.task.ravel(), t.assigned.ravel()], book.told)
+    told = dataclasses.replace(told, ahead=flat(t.ahead))
     logits, value = control(params(), flat(t.view), told)
     own = ~t.shielded.ravel()
     np.testing.assert_allclose(t.log_prob.ravel()[own], log_probs(logits, t.action.ravel())[own], atol=1e-5)
@@ -262,7 +284,8 @@ def test_cut_episodes_bootstrap_with_the_state_they_were_cut_in(book: TaskBook, 
     assert going_on.sum() > 5
     np.testing.assert_allclose(t.plan_bootstrap[-1][going_on], value[-1][going_on], atol=1e-5)
     after = rollouts()[2].after.worker
-    told = jax.tree.map(lambda x: np.repeat(x[after.task, after.assigned], T, 0), book.told)
+    told = jax.tree.map(lambda x: x[after.task, after.assigned], book.told)
+    told = jax.tree.map(lambda x: np.repeat(x, T, 0), dataclasses.replace(told, ahead=after.ahead))
     views = jax.tree.map(lambda x: np.repeat(x, T, 0), after.view)
     low = np.asarray(control(params(), views, told)[1])[::T]
     np.testing.assert_allclose(t.bootstrap[-1][going_on], low[going_on], atol=1e-5)
@@ -291,6 +314,7 @@ def low_log_probs(params: Any, low: LowBatch) -> jax.Array:
     told = jax.vmap(jax.vmap(AGENT.instruct, (None, 0)), (None, 0))(params, low.tree)
     row = jnp.arange(low.slot.shape[0])[:, None]
     told = jax.tree.map(lambda x: x[row, low.slot, low.edge], told)
+    told = dataclasses.replace(told, ahead=low.ahead)
     logits, _ = jax.vmap(jax.vmap(AGENT.control, (None, 0, 0)), (None, 0, 0))(params, low.view, told)
     return jnp.take_along_axis(jax.nn.log_softmax(logits), low.action[..., None], -1)[..., 0]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -30,13 +31,23 @@ from tests.probes import (
     small_config,
 )
 
-# a at 0, b at 4, c at 6; episodes start at 1, 2 or 3.
+# a at 0, b at 4, c at 5; episodes start at 1, 2 or 3.
 ENV = Corridor()
-CONFIG = small_config()
+CONFIG = small_config(
+    network=dataclasses.replace(
+        small_config().network,
+        latent=32,
+        encoder_mlp=(64,),
+        planner_hidden=32,
+        planner_features=32,
+        critic=(64,),
+        actor=(64,),
+    )
+)
 TRAINER = Trainer(Agent(ENV, CONFIG))
 GAMMA = CONFIG.discount
 TASKS = ("a or b", "b or a", "achieve a", "a ensuring not b", "(a or b); c", "a; b", "a or b")
-ITERATIONS = 100
+ITERATIONS = CONFIG.num_iterations
 NOTHING_RESERVED = np.zeros(1, np.uint32)
 
 
@@ -145,8 +156,8 @@ def test_first_episodes_are_staggered() -> None:
 
 
 def test_rows_that_do_not_divide_are_refused() -> None:
-    config = small_config(low=PPOConfig(minibatches=7))
-    with pytest.raises(ValueError, match="24 rows do not divide into 7 minibatches"):
+    config = dataclasses.replace(CONFIG, low=PPOConfig(minibatches=7))
+    with pytest.raises(ValueError, match="48 rows do not divide into 7 minibatches"):
         jax.eval_shape(Trainer(Agent(ENV, config)).iterate, fresh(), bank(), machine(), NOTHING_RESERVED)
 
 
@@ -160,6 +171,7 @@ def test_level_two_is_reached() -> None:
     assert not any(value for metrics in history for name, value in metrics.items() if "skipped" in name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "best"),
     [
@@ -167,7 +179,7 @@ def test_level_two_is_reached() -> None:
         ("a ensuring not b", {1: 1, 2: 2, 3: 3}),
         ("a or b", {1: 1, 2: 2, 3: 1}),
         ("a; b", {1: 5, 2: 6, 3: 7}),
-        ("(a or b); c", {1: 5, 2: 4, 3: 3}),  # from 1 the nearest goal is the wrong one
+        ("(a or b); c", {1: 4, 2: 3, 3: 2}),  # from 1 the nearest goal is the wrong one
     ],
 )
 def test_greedy_episodes_are_as_short_as_can_be(name: str, best: dict[int, int]) -> None:
@@ -176,7 +188,9 @@ def test_greedy_episodes_are_as_short_as_can_be(name: str, best: dict[int, int])
     trees = bank_of([task(name)], len(starts))
     layouts = CorridorLayout(start=starts)
     agent = TRAINER.agent
-    result = run_episodes(jax.random.key(0), agent, state.params, machine(), trees, layouts, greedy=True)
+    result = run_episodes(jax.random.key(0), agent, state.params, machine(), trees, layouts, greedy=True, shield=True)
+    # With the shield, as collected: steps that it replaced are not the policy's, so beside a forbidden letter it learns
+    # nothing of avoiding it.
     assert result.success.all()
     assert result.steps.tolist() == list(best.values()) * 2
 
@@ -193,6 +207,7 @@ def planner_at(name: str) -> tuple[np.ndarray, np.ndarray]:
     return jax.tree.map(np.asarray, quick_jit(jax.vmap(one))(ENV.view_at(np.array([1, 2, 3]))))
 
 
+@pytest.mark.slow
 def test_the_planner_picks_the_shorter_branch() -> None:
     for name, nearest in (("a or b", 1), ("b or a", 2)):
         chosen, _ = planner_at(name)
@@ -202,11 +217,12 @@ def test_the_planner_picks_the_shorter_branch() -> None:
     assert (chosen[:, 2] > 0.8).all()  # b lies on the way to c
 
 
+@pytest.mark.slow
 def test_the_planner_knows_the_values() -> None:
     """γ^(steps - 1), the return of the best branch."""
     np.testing.assert_allclose(planner_at("achieve a")[1], GAMMA ** np.array([0, 1, 2]), atol=0.12)
     np.testing.assert_allclose(planner_at("a or b")[1], GAMMA ** np.array([0, 1, 0]), atol=0.12)
-    np.testing.assert_allclose(planner_at("(a or b); c")[1], GAMMA ** np.array([4, 3, 2]), atol=0.12)
+    np.testing.assert_allclose(planner_at("(a or b); c")[1], GAMMA ** np.array([3, 2, 1]), atol=0.12)
 
 
 def test_the_low_level_knows_the_values() -> None:
@@ -246,12 +262,12 @@ def test_the_reach_critic_learns_the_distance() -> None:
             def loss(p: Any) -> Any:
                 return training.reach_loss(agent, p, batch, settings, jnp.float32(0))
 
-            params, state, metrics = ppo.gradient_step(loss, params, state, transform, jnp.float32(0.01))
+            params, state, metrics = ppo.gradient_step(loss, params, state, transform, jnp.float32(0.005))
             return (params, state), metrics["value_loss"]
 
         return jax.lax.scan(fit_one, (params, state), walks)
 
-    walks = jax.tree.map(lambda *x: np.stack(x), *[walk() for _ in range(600)])
+    walks = jax.tree.map(lambda *x: np.stack(x), *[walk() for _ in range(3000)])
     params = random_params(agent, 0)["reach_critic"]
     (params, _), losses = fit(params, transform.init(params), walks)
     values = jax.vmap(lambda view: agent.reach_values({"reach_critic": params}, view).max(-1))(
