@@ -164,6 +164,7 @@ def test_rows_that_do_not_divide_are_refused() -> None:
 # --- What is learned ---
 
 
+@pytest.mark.slow
 def test_level_two_is_reached() -> None:
     state, history = trained()
     assert int(state.curriculum.level) == 1
@@ -225,6 +226,7 @@ def test_the_planner_knows_the_values() -> None:
     np.testing.assert_allclose(planner_at("(a or b); c")[1], GAMMA ** np.array([3, 2, 1]), atol=0.12)
 
 
+@pytest.mark.slow
 def test_the_low_level_knows_the_values() -> None:
     params, agent, tree = trained()[0].params, TRAINER.agent, on_device(task("a; b"))
     told = jax.tree.map(lambda x: x[1], agent.instruct(params, tree))
