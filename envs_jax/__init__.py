@@ -12,6 +12,7 @@ from typing import Any
 from envs_jax.base import Box, Discrete, Environment, EnvParams
 from envs_jax.layouts import load_layouts, save_layouts
 from envs_jax.letter import Letter, LetterState
+from envs_jax.walk import Walk, WalkLayout, WalkState, flatworld
 
 __all__ = [
     "Box",
@@ -20,6 +21,9 @@ __all__ = [
     "Environment",
     "Letter",
     "LetterState",
+    "Walk",
+    "WalkLayout",
+    "WalkState",
     "load_layouts",
     "make",
     "registered",
@@ -29,6 +33,8 @@ __all__ = [
 _REGISTRY: dict[str, Callable[..., Environment]] = {
     "letter": functools.partial(Letter, name="letter"),
     "letter12": functools.partial(Letter, name="letter12", num_letters=12, num_cells=24),
+    "walk": functools.partial(Walk, name="walk"),
+    "flatworld": flatworld,
 }
 
 
