@@ -1,0 +1,102 @@
+"""Where a Zone episode takes place, and how such places are drawn.
+
+Axes: **P** = 4 colours, **Z** = 2 zones of each.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+COLOURS = ("blue", "green", "red", "yellow")
+ZONES_EACH = 2
+NUM_ZONES = len(COLOURS) * ZONES_EACH
+
+SPAWN = 2.5
+"""Half the side of the square in which objects and their keep-outs lie (m)."""
+ROBOT_KEEPOUT, ZONE_KEEPOUT = 0.4, 0.55
+"""Radii (m): no two keep-outs overlap, and none leaves the square."""
+MOST_DRAWS = 100
+"""Draws for one object before the whole layout is begun anew."""
+
+_BLOCK = 20
+"""Draws made at once: most objects find their place in one block."""
+_NOWHERE = 1e6
+"""Coordinates of what is not placed yet: far from everything."""
+
+
+@struct.dataclass
+class ZoneLayout:
+    """A layout of Zone.
+
+    Attributes:
+        robot: float ``[3]``, where the robot starts: x, y (m), heading (rad).
+        zones: float ``[P, Z, 2]``, centres of the zones (m).
+    """
+
+    robot: jax.Array  # float [3]
+    zones: jax.Array  # float [P, Z, 2]
+
+
+@struct.dataclass
+class _Draw:
+    """A layout in the making: robot first, then zones in order."""
+
+    key: jax.Array
+    placed: jax.Array  # float [1 + P·Z, 2]
+    count: jax.Array  # int32 [], objects placed
+    draws: jax.Array  # int32 [], draws made for the next one
+    done: jax.Array  # bool []
+
+
+def new_layout(key: jax.Array, layout: ZoneLayout, needed: jax.Array) -> ZoneLayout:
+    """A random layout other than ``layout`` where ``needed`` (bool ``[]``), else ``layout``. The key is consumed.
+
+    Objects are placed in order, each at the first of at most ``MOST_DRAWS`` uniform draws that keeps its distance from
+    those before it; when one finds no place (2.5 % of the layouts) the layout is begun anew. All of it is one loop over
+    blocks of draws, so that under ``vmap`` a layout that fails or takes long does not make the others wait for whole
+    layouts, and that costs nothing where nothing is needed. The loop has no limit: a layout takes more than k attempts
+    with probability 0.025^k.
+    """
+    dtype = jnp.result_type(float)
+    heading_key, key = jax.random.split(key)
+    heading = jax.random.uniform(heading_key, (), dtype, 0.0, 2 * jnp.pi)
+    previous = jnp.concatenate([layout.robot[None, :2], layout.zones.reshape(-1, 2)]).astype(dtype)
+    nothing = jnp.full((1 + NUM_ZONES, 2), _NOWHERE, dtype)
+    start = _Draw(key=key, placed=nothing, count=jnp.int32(0), draws=jnp.int32(0), done=~needed)
+    drawn = jax.lax.while_loop(lambda draw: ~draw.done, lambda draw: _place_next(draw, previous), start)
+    fresh = ZoneLayout(
+        robot=jnp.concatenate([drawn.placed[0], heading[None]]),
+        zones=drawn.placed[1:].reshape(len(COLOURS), ZONES_EACH, 2),
+    )
+    return jax.tree.map(lambda new, old: jnp.where(needed, new, old.astype(dtype)), fresh, layout)
+
+
+def _place_next(draw: _Draw, previous: jax.Array) -> _Draw:
+    """One block of draws for the next object."""
+    index = np.arange(1 + NUM_ZONES)
+    key, draw_key = jax.random.split(draw.key)
+    is_robot = draw.count == 0
+    reach = jnp.where(is_robot, SPAWN - ROBOT_KEEPOUT, SPAWN - ZONE_KEEPOUT)
+    candidates = reach * jax.random.uniform(draw_key, (_BLOCK, 2), draw.placed.dtype, -1.0, 1.0)
+    # The robot comes first, so what is being placed near something else is always a zone.
+    apart = np.where(index == 0, ROBOT_KEEPOUT + ZONE_KEEPOUT, 2 * ZONE_KEEPOUT)
+    dx = candidates[:, None, 0] - draw.placed[:, 0]
+    dy = candidates[:, None, 1] - draw.placed[:, 1]
+    free = (dx * dx + dy * dy >= apart**2).all(-1)
+    found = free.any()
+    place = candidates[jnp.argmax(free)]
+    placed = jnp.where(((index == draw.count) & found)[:, None], place, draw.placed)
+    count = draw.count + found
+    draws = jnp.where(found, 0, draw.draws + _BLOCK)
+    complete = count == len(index)
+    failed = (draws >= MOST_DRAWS) | (complete & (placed == previous).all())
+    return _Draw(
+        key=key,
+        placed=jnp.where(failed, _NOWHERE, placed),
+        count=jnp.where(failed, 0, count),
+        draws=jnp.where(failed, 0, draws),
+        done=complete & ~failed,
+    )
