@@ -16,6 +16,7 @@ import numpy as np
 from flax import struct
 
 from envs_jax.base import Box, Discrete, Environment, EnvParams, StepResult
+from envs_jax.letter_contested import most_contested, myopia_regret
 
 NO_LETTER = -1
 MOVES = np.array([[-1, 0], [1, 0], [0, -1], [0, 1]], np.int32)
@@ -23,6 +24,9 @@ MOVES = np.array([[-1, 0], [1, 0], [0, -1], [0, 1]], np.int32)
 
 MOST_ROWS = 32
 """A row of cells is kept in one 32-bit word while layouts are checked."""
+
+CONTESTED_TRIES = 8
+"""Pairs of letters among which a contested layout is chosen: the more, the more often nearest-first loses."""
 
 LEAST_ACCEPTANCE = 0.01
 """Sizes are refused when fewer random layouts than this share have all letters reachable."""
@@ -121,6 +125,29 @@ class Letter(Environment):
         nothing = jnp.full((self.size, self.size), NO_LETTER, jnp.int8)
         return self.resample_layout(key, nothing, jnp.bool_(True), params)
 
+    def contested_layout(self, key: jax.Array, first: jax.Array, second: jax.Array, params: EnvParams) -> jax.Array:
+        """A random layout for a task that wants one letter and then another, chosen for what nearest-first would lose.
+
+        The letters of a random layout trade places, so that the pair of letters on which nearest-first loses most,
+        among ``CONTESTED_TRIES`` random pairs, becomes the pair wanted.
+
+        Args:
+            key: consumed.
+            first, second: bool ``[P]``, the letter wanted first, and second; if either is empty any layout will do.
+            params: unused here.
+        """
+        layout_key, pair_key = jax.random.split(key)
+        layout = self.sample_layout(layout_key, params)
+        if self.num_letters < 2:
+            return layout
+        pair = most_contested(pair_key, myopia_regret(layout, self.num_letters), CONTESTED_TRIES)
+        name = jnp.arange(self.num_letters)
+        for found, wanted in zip(pair, (jnp.argmax(first), jnp.argmax(second)), strict=True):
+            found = name[found]  # it may have been renamed by the first exchange
+            name = jnp.where(name == found, wanted, jnp.where(name == wanted, found, name))
+        renamed = jnp.where(layout == NO_LETTER, NO_LETTER, name[layout]).astype(jnp.int8)
+        return jnp.where(first.any() & second.any(), renamed, layout)
+
     def resample_layout(self, key: jax.Array, layout: jax.Array, needed: jax.Array, params: EnvParams) -> jax.Array:
         """A random layout other than ``layout`` where ``needed``, else ``layout``.
 
@@ -210,12 +237,6 @@ class Letter(Environment):
     def graph_state(self, state: LetterState) -> jax.Array:
         """The agent's cell as a state of :meth:`transition_table`, int32 ``[]``."""
         return state.position[0] * self.size + state.position[1]
-
-    def distances(self) -> jax.Array:
-        """Moves between any two cells of the torus, int32 ``[S, S]``; the layout forbids none."""
-        rows, columns = np.divmod(np.arange(self.size**2), self.size)
-        apart = [np.abs(x[:, None] - x[None, :]) for x in (rows, columns)]
-        return jnp.asarray(sum(np.minimum(d, self.size - d) for d in apart), jnp.int32)
 
     def _place_letters(self, key: jax.Array) -> jax.Array:
         """Letters on uniformly drawn cells other than (0, 0), int8 ``[n, n]``.

@@ -44,7 +44,7 @@ def hrlspec() -> Config:
         max_operator=False,
         unfinished=True,
         low=PPOConfig(learning_rate=7e-4, epochs=2, minibatches=16, entropy=0.01, final_entropy=0.002),
-        high=PPOConfig(learning_rate=2e-4, epochs=2, minibatches=4, entropy=0.005, final_entropy=0.005),
+        high=PPOConfig(learning_rate=3e-4, epochs=1, minibatches=4, entropy=0.005, final_entropy=0.005),
         network=NetworkConfig(
             # Seen by role the grid needs no convolution: a third of the time, and no worse.
             conv_channels=(),

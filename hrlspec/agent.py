@@ -100,45 +100,63 @@ class Agent:
 
     def plan(self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction) -> Estimate:
         """The planner on one environment: logits over edges ``[N]`` and the value of the remaining task ``[]``."""
-        return self.plan_ahead(params, view, tree, state, told)[:2]
+        batch = jax.tree.map(lambda x: x[None], (view, tree, state, told))
+        logits, value, _ = self.plan_ahead(params, *batch)
+        return logits[0], value[0]
 
     def plan_ahead(
         self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """As :meth:`plan`, and what the low level is told to look ahead to after each edge, ``[N, D, P]``."""
+        """The planner on B environments, and what the low level is told to look ahead to.
+
+        Returns:
+            Logits over edges ``[B, N]``, values ``[B]``, and what lies ahead after each edge, ``[B, N, D, P]``.
+        """
         if self.config.network.advice:
             advice, ahead = self.advise(params, view, tree, state, told)
         else:
-            advice, ahead = jnp.zeros(tree.num_nodes), told.ahead
-        logits, value = cast(Estimate, self.planner.apply(params["planner"], view, tree, state, advice))
-        return logits, value, ahead
+            advice, ahead = jnp.zeros(tree.parent.shape), told.ahead
+        plan: Any = jax.vmap(self.planner.apply, in_axes=(None, 0, 0, 0, 0))
+        return (*plan(params["planner"], view, tree, state, advice), ahead)
 
     def advise(
         self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
     ) -> tuple[jax.Array, jax.Array]:
-        """The low level's advice: its value of each feasible edge, followed by the best way on to a leaf.
+        """The low level's advice in B environments: its value of each feasible edge and the best way on to a leaf.
 
         Every way from the current node to a leaf is a sequence of sub-tasks, which the low level's critic values
-        much better than a tree.
+        much better than a tree. Most tasks have few ways, so all that exist are valued side by side.
 
         Returns:
-            Values of edges ``[N]``, without gradient, and what lies ahead on each edge's best way, ``[N, D, P]``.
+            Values of edges ``[B, N]``, without gradient, and what lies ahead on each edge's best way,
+            ``[B, N, D, P]``.
         """
+        edge, known, ways = jax.vmap(self._ways)(tree, state, told)
+        num_ways = known.shape[1]
+
+        def value(inputs: tuple[jax.Array, Instruction]) -> jax.Array:
+            env, way = inputs
+            seen = jax.tree.map(lambda x: x[env], view)
+            return jax.vmap(self.control, in_axes=(None, 0, 0))(params, seen, way)[1]
+
+        env = jnp.repeat(jnp.arange(known.shape[0]), num_ways)
+        flat_ways = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), ways)
+        group = 2 * self.config.group
+        values = in_groups(value, known.reshape(-1), (env, flat_ways), jnp.zeros(env.shape), group)
+        advice, ahead = jax.vmap(_weigh)(edge, known, values.reshape(known.shape), ways.ahead, told.ahead)
+        return jax.lax.stop_gradient(advice), ahead
+
+    def _ways(self, tree: TaskTree, state: TaskState, told: Instruction) -> tuple[jax.Array, jax.Array, Instruction]:
+        """The ways open in one environment: first edges ``[W]``, which of them exist ``[W]``, and instructions."""
         num_nodes = tree.num_nodes
         way = routes(tree, state.node, 1 + told.ahead.shape[1])
         leads = tree.accepting & (way[:, 0] >= 0) & open_edges(tree, state)[way[:, 0]]
         leaf = jnp.nonzero(leads, size=min(self.config.network.advised, num_nodes), fill_value=num_nodes)[0]
-        known, way = leaf < num_nodes, way[jnp.minimum(leaf, num_nodes - 1)]
+        way = way[jnp.minimum(leaf, num_nodes - 1)]
         edge, later = way[:, 0], way[:, 1:]
         ahead = tree.reach[later] & (later >= 0)[..., None] & self.config.future_embedding
         some = dataclasses.replace(jax.tree.map(lambda x: x[edge], told), ahead=ahead.astype(jnp.float32))
-        values = jax.vmap(self.control, in_axes=(None, None, 0))(params, view, some)[1]
-        mine = (edge == jnp.arange(num_nodes)[:, None]) & known
-        score = jnp.where(mine, values, -jnp.inf)
-        worst = jnp.where(known.any(), jnp.where(known, values, jnp.inf).min(), 0.0)
-        advice = jnp.where(mine.any(1), score.max(1), worst)
-        best = some.ahead[score.argmax(1)]
-        return jax.lax.stop_gradient(advice), jnp.where(mine.any(1)[:, None, None], best, told.ahead)
+        return edge, leaf < num_nodes, some
 
     def control(self, params: Params, view: View, told: Instruction) -> tuple[jax.Array, jax.Array]:
         """The low level on one environment: action logits ``[A]`` and value ``[]``."""
@@ -147,6 +165,17 @@ class Agent:
     def reach_values(self, params: Params, view: View) -> jax.Array:
         """Q(s, g, a) of reaching each proposition, float32 ``[P, A]``."""
         return cast(jax.Array, self.reach_critic.apply(params["reach_critic"], view))
+
+
+def _weigh(
+    edge: jax.Array, known: jax.Array, values: jax.Array, way_ahead: jax.Array, told_ahead: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """From values of ways ``[W]`` to each edge's best value ``[N]`` and what lies ahead on its best way."""
+    mine = (edge == jnp.arange(told_ahead.shape[0])[:, None]) & known
+    score = jnp.where(mine, values, -jnp.inf)
+    worst = jnp.where(known.any(), jnp.where(known, values, jnp.inf).min(), 0.0)
+    advice = jnp.where(mine.any(1), score.max(1), worst)
+    return advice, jnp.where(mine.any(1)[:, None, None], way_ahead[score.argmax(1)], told_ahead)
 
 
 def sample(logits: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:

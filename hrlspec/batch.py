@@ -72,7 +72,7 @@ def build(
 ) -> tuple[LowBatch, PlanBatch]:
     """Relabels, computes the targets of both levels, and picks the planner's samples. The key is consumed."""
     config = agent.config
-    num_slots = max(2, config.num_steps // 5)
+    num_slots = config.episode_slots
     relabel_key, pick_key = jax.random.split(key)
     by_env = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), trajectory)
     num_copies = round(config.relabel.share * config.num_envs)
@@ -205,7 +205,7 @@ def _copies(
         view, row, node, edge = inputs
         tree, told = jax.tree.map(lambda x: x[row], (fresh.tree, fresh.told))
         state = dataclasses.replace(jax.vmap(initial)(tree), node=node)
-        logits, value = jax.vmap(agent.plan, in_axes=(None, 0, 0, 0, 0))(params, view, tree, state, told)
+        logits, value, _ = agent.plan_ahead(params, view, tree, state, told)
         return jnp.take_along_axis(jax.nn.log_softmax(logits), edge[:, None], 1)[:, 0], value
 
     decided = new.decided.reshape(-1)

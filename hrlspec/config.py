@@ -85,9 +85,8 @@ class CurriculumConfig:
     tree_share: float = 0.0
     """Share of random trees, instead of sequences, in each level's tasks."""
     contested: float = 0.0
-    """Share of episodes whose layout is the best of ``candidates`` for teaching look-ahead: the one where
-    nearest-first loses most. Only in environments that know the distances between their states."""
-    candidates: int = 8
+    """Share of episodes in layouts made to teach look-ahead, where nearest-first loses. Only in environments with a
+    ``contested_layout``."""
     max_branching: int = 3
     max_avoid: int = 3
     tasks_per_level: int = 512
@@ -162,6 +161,11 @@ class Config:
     def steps_per_iteration(self) -> int:
         """E·T, environment steps of one iteration."""
         return self.num_envs * self.num_steps
+
+    @property
+    def episode_slots(self) -> int:
+        """Episodes of one environment that a rollout tells apart; what comes after them is left out of the update."""
+        return max(2, self.num_steps // 5)
 
     @property
     def num_iterations(self) -> int:

@@ -109,7 +109,7 @@ def plan_where(
     def decide(inputs: Any) -> tuple[jax.Array, ...]:
         view, task, state, noise = inputs
         tree, told = jax.tree.map(lambda x: x[task], (book.tree, book.told))
-        logits, value, ahead = jax.vmap(agent.plan_ahead, in_axes=(None, 0, 0, 0, 0))(params, view, tree, state, told)
+        logits, value, ahead = agent.plan_ahead(params, view, tree, state, told)
         choice, log_prob = jax.vmap(sample)(logits, noise)
         return choice, ahead[jnp.arange(choice.shape[0]), choice], log_prob, value
 

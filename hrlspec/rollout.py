@@ -13,10 +13,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from hrlspec import curriculum, regret
+from hrlspec import curriculum
 from hrlspec.agent import Agent, Params, TaskBook, View
 from hrlspec.interaction import Decision, Worker, act, plan_where, restart_where, transition
 from hrlspec.rewards import RewardMachine
+from hrlspec.spec import TaskTree
 
 
 @struct.dataclass
@@ -71,28 +72,19 @@ class Collector:
 def fill_pool(key: jax.Array, agent: Agent, book: TaskBook, level: jax.Array, size: int) -> Pool:
     """Draws tasks of the curriculum's levels and layouts for them, ``size`` for each environment. The key is consumed.
 
-    Where the configuration asks for contested layouts, several are drawn and the one where nearest-first loses
-    most is kept.
+    A share ``contested`` of the layouts is contested, in environments that know how to draw such layouts.
     """
     config = agent.config.curriculum
-    env: Any = agent.env  # what finite environments offer besides the contract is optional
-    selective = config.contested > 0 and hasattr(env, "distances")
-    candidates = config.candidates if selective else 1
+    env: Any = agent.env  # to draw contested layouts is no duty of environments
+    selective = config.contested > 0 and hasattr(env, "contested_layout")
 
     def draw(key: jax.Array, task: jax.Array) -> Any:
-        keys = jax.random.split(key, candidates + 1)
-        layouts = jax.vmap(env.sample_layout, in_axes=(0, None))(keys[1:], env.default_params)
-        best = jnp.int32(0)
-        if selective:
-            first, second = regret.opening(jax.tree.map(lambda x: x[task], book.tree))
-
-            def lost(layout: Any) -> jax.Array:
-                _, labels, start = env.transition_table(layout, env.default_params)
-                return regret.myopia_regret(env.distances(), labels, start, first, second)
-
-            wanted = jax.random.bernoulli(keys[0], config.contested)
-            best = jnp.where(wanted, jnp.argmax(jax.vmap(lost)(layouts)), 0)
-        return jax.tree.map(lambda x: x[best], layouts)
+        if not selective:
+            return env.sample_layout(key, env.default_params)
+        coin, key = jax.random.split(key)
+        wanted = jax.random.bernoulli(coin, config.contested)
+        first, second = opening(jax.tree.map(lambda x: x[task], book.tree))
+        return env.contested_layout(key, first & wanted, second & wanted, env.default_params)
 
     def one(index: jax.Array) -> Pool:
         keys = jax.random.split(jax.random.fold_in(key, index), 3)
@@ -102,6 +94,12 @@ def fill_pool(key: jax.Array, agent: Agent, book: TaskBook, level: jax.Array, si
         return Pool(layout=jax.vmap(draw)(jax.random.split(keys[2], size), tasks), task=tasks, level=levels)
 
     return jax.vmap(one)(jnp.arange(agent.config.num_envs))
+
+
+def opening(tree: TaskTree) -> tuple[jax.Array, jax.Array]:
+    """What a task's first edge reaches and what the first edge after it does, bool ``[P]`` each; all false if none."""
+    second = (tree.parent == 1) & tree.valid
+    return tree.reach[1], tree.reach[jnp.argmax(second)] & second.any()
 
 
 def collect(

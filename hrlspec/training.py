@@ -123,7 +123,7 @@ class Trainer:
             state.collector,
             worker=dataclasses.replace(state.collector.worker, task=jnp.arange(config.num_envs, dtype=jnp.int32)),
         )
-        pool = fill_pool(keys[0], agent, book, state.curriculum.level, size=max(2, config.num_steps // 4))
+        pool = fill_pool(keys[0], agent, book, state.curriculum.level, size=config.episode_slots)
         collector, trajectory = collect(keys[1], agent, state.params, machine, book, collector, pool)
         low, plan = build(keys[2], agent, state.params, machine, book, trajectory, reserved)
         params, optimisers, losses = self._learn(keys[3], state, low, plan, trajectory)
@@ -292,10 +292,8 @@ def reach_loss(
 def _advice(agent: Agent, params: Params, batch: PlanBatch) -> jax.Array:
     """The low level's advice on each decision, ``[B, N]``, at the start of the update."""
 
-    def one(view: Any, tree: TaskTree, state: TaskState) -> jax.Array:
-        return agent.advise(params, view, tree, state, agent.instruct(params, tree))[0]
-
-    return jax.vmap(one)(batch.view, batch.tree, plan_state(batch))
+    told = jax.vmap(agent.instruct, in_axes=(None, 0))(params, batch.tree)
+    return agent.advise(params, batch.view, batch.tree, plan_state(batch), told)[0]
 
 
 def _fit(

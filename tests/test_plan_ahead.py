@@ -1,4 +1,4 @@
-"""Ways to the leaves, the low level's advice on them, and which layouts teach look-ahead."""
+"""Ways to the leaves, and the low level's advice on them."""
 
 from __future__ import annotations
 
@@ -8,10 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import envs_jax
 from hrlspec.agent import Agent
 from hrlspec.networks.tree import lookahead, routes
-from hrlspec.regret import myopia_regret, opening
 from hrlspec.spec import TaskTree, advance, initial, open_edges
 from tests.probes import Corridor, on_device, quick_jit, random_params, small_config
 from tests.tasks import random_tree, tree_of
@@ -59,7 +57,7 @@ def test_advice_is_the_value_of_the_best_way_and_that_way_is_handed_down() -> No
     agent = Agent(ENV, small_config(network=network))
     params, view = random_params(agent, 2), ENV.view_at(2)
     control = quick_jit(lambda told: agent.control(params, view, told)[1])
-    advise = quick_jit(lambda tree, state, told: agent.advise(params, view, tree, state, told))
+    advise = quick_jit(lambda *batch: agent.advise(params, *batch))
     rng = np.random.default_rng(2)
     several = 0
     for _ in range(20):
@@ -67,7 +65,8 @@ def test_advice_is_the_value_of_the_best_way_and_that_way_is_handed_down() -> No
         labels = jnp.asarray(rng.random(ENV.num_propositions) < 0.4)
         state = advance(tree, initial(tree), labels, TaskTree.NO_NODE)
         told = agent.instruct(params, tree)
-        advice, ahead = advise(tree, state, told)
+        batch = jax.tree.map(lambda x: x[None], (view, tree, state, told))
+        advice, ahead = jax.tree.map(lambda x: x[0], advise(*batch))
         for edge in np.flatnonzero(open_edges(tree, state)):
             scores = {}
             for leaf in np.flatnonzero(tree.accepting):
@@ -83,42 +82,3 @@ def test_advice_is_the_value_of_the_best_way_and_that_way_is_handed_down() -> No
             np.testing.assert_allclose(advice[edge], best, rtol=1e-5)
             np.testing.assert_array_equal(ahead[edge], later)
     assert several > 3
-
-
-def test_regret_is_what_nearest_first_loses() -> None:
-    env = envs_jax.make("letter", size=5, num_letters=3, num_cells=6)
-    params = env.default_params
-    layouts = jax.vmap(env.sample_layout, (0, None))(jax.random.split(jax.random.key(0), 200), params)
-    task = on_device(tree_of([(0, "a", ""), (1, "b", "")], num_propositions=3))
-    first, second = opening(task)
-
-    @jax.jit
-    def regret(layout: jax.Array) -> jax.Array:
-        _, labels, start = env.transition_table(layout, params)
-        return myopia_regret(env.distances(), labels, start, first, second)
-
-    def apart(x: np.ndarray, y: np.ndarray) -> int:
-        gap = np.abs(x - y)
-        return int(np.minimum(gap, env.size - gap).sum())
-
-    found = np.asarray(jax.vmap(regret)(layouts))
-    for layout, steps in zip(np.asarray(layouts), found, strict=True):
-        ways = []
-        for x in np.argwhere(layout == 0):
-            near = apart(np.zeros(2, int), x)
-            ways.append((near, near + min(apart(x, y) for y in np.argwhere(layout == 1))))
-        nearest = min(near for near, _ in ways)
-        worst = max(total for near, total in ways if near == nearest)
-        assert steps == worst - min(total for _, total in ways)
-    assert (found > 0).any()
-    assert (found == 0).any()
-
-
-def test_a_task_of_one_step_has_no_regret() -> None:
-    env = envs_jax.make("letter")
-    _, labels, start = env.transition_table(
-        env.sample_layout(jax.random.key(1), env.default_params), env.default_params
-    )
-    first, second = opening(on_device(tree_of([(0, "a", ""), (0, "b", "")])))
-    assert not second.any()
-    assert int(myopia_regret(env.distances(), labels, start, first, second)) == 0

@@ -64,7 +64,7 @@ def routes(tree: TaskTree, node: jax.Array, length: int) -> jax.Array:
         return jnp.where(tree.parent[here] >= 0, tree.parent[here], here), way
 
     start = jnp.arange(tree.num_nodes, dtype=jnp.int32)
-    _, way = jax.lax.fori_loop(0, tree.num_nodes, climb, (start, nothing))
+    _, way = jax.lax.fori_loop(0, tree.depth.max() + 1, climb, (start, nothing))
     below = tree.valid & (tree.parent[way[:, 0]] == node) & (way[:, 0] >= 0)
     return jnp.where(below[:, None], way, TaskTree.NO_NODE)
 

@@ -15,11 +15,20 @@ import pytest
 import envs_jax
 
 NUM = 8
+ONE_LAYOUT = {"walk"}
+"""Environments that show only a position: regions stay where they are, and so does the start."""
+MAY_FAIL = {"flatworld", "zone", "zone-nm"}
+"""Environments whose episodes end where the square does."""
 
 
 @pytest.fixture(scope="module", params=envs_jax.registered())
 def env(request: pytest.FixtureRequest) -> envs_jax.Environment:
     return envs_jax.make(request.param)
+
+
+def _still(env: envs_jax.Environment) -> jax.Array:
+    """An action that leads nowhere far."""
+    return jnp.zeros(env.action_space.shape, env.action_space.dtype)
 
 
 @functools.cache
@@ -32,8 +41,14 @@ def _same(left: object, right: object) -> bool:
     return all(jax.tree.leaves(jax.tree.map(np.array_equal, left, right)))
 
 
+def _alike(left: object, right: object) -> bool:
+    """The same up to what a compiler may round differently in another program."""
+    close = functools.partial(np.allclose, rtol=1e-5, atol=1e-4)
+    return all(jax.tree.leaves(jax.tree.map(close, left, right)))
+
+
 def _rollout(env: envs_jax.Environment, params: envs_jax.EnvParams, num_steps: int, seed: int = 0):
-    """States before, and results of, ``num_steps`` random auto-reset steps of NUM environments (axes T, E)."""
+    """States before, actions, and results of ``num_steps`` random auto-reset steps of NUM environments (axes T, E)."""
 
     def one(key: jax.Array):
         key, reset_key = jax.random.split(key)
@@ -41,8 +56,9 @@ def _rollout(env: envs_jax.Environment, params: envs_jax.EnvParams, num_steps: i
 
         def body(state, key):
             action_key, step_key = jax.random.split(key)
-            result = env.step(step_key, state, env.action_space.sample(action_key), params)
-            return result[1], (state, result)
+            action = env.action_space.sample(action_key)
+            result = env.step(step_key, state, action, params)
+            return result[1], (state, action, result)
 
         return jax.lax.scan(body, state, jax.random.split(key, num_steps))[1]
 
@@ -96,8 +112,7 @@ def test_truncation_is_not_termination(env: envs_jax.Environment) -> None:
     _, state = _jitted(env, "reset")(jax.random.key(0), params)
     step_env = _jitted(env, "step_env")
     for t in range(1, 6):
-        action = env.action_space.sample(jax.random.key(t))
-        _, state, reward, terminated, truncated, _ = step_env(jax.random.key(t), state, action, params)
+        _, state, reward, terminated, truncated, _ = step_env(jax.random.key(t), state, _still(env), params)
         assert bool(truncated) == (t == 5)
         assert not bool(terminated)
         assert float(reward) == 0.0
@@ -106,21 +121,22 @@ def test_truncation_is_not_termination(env: envs_jax.Environment) -> None:
 def test_auto_reset_keeps_the_final_observation_and_never_repeats_a_layout(env: envs_jax.Environment) -> None:
     params = env.default_params.replace(horizon=jnp.int32(4))
     step_env, reset_to = _jitted(env, "step_env"), _jitted(env, "reset_to")
-    states, (observations, after, _, terminated, truncated, info) = _rollout(env, params, 14)
-    assert not terminated.any()
-    assert np.array_equal(truncated, np.arange(1, 15)[:, None] % 4 + np.zeros(NUM) == 0)
+    states, actions, (observations, after, _, terminated, truncated, info) = _rollout(env, params, 14)
+    assert env.name in MAY_FAIL or not terminated.any()
+    assert np.array_equal(truncated, states.time + 1 == 4)
+    assert truncated.sum(0).min() >= 1
+    done = terminated | truncated
     for t, e in np.ndindex(14, NUM):
-        before, now = jax.tree.map(lambda x, t=t, e=e: x[t, e], (states, after))
+        before, action, now = jax.tree.map(lambda x, t=t, e=e: x[t, e], (states, actions, after))
         seen, final = observations[t, e], info["final_observation"][t, e]
-        if not truncated[t, e]:
+        if not done[t, e]:
             assert np.array_equal(seen, final)
             assert _same(before.layout, now.layout)
             continue
-        assert not _same(before.layout, now.layout)
+        assert _same(before.layout, now.layout) == (env.name in ONE_LAYOUT)
         fresh = reset_to(now.layout, jax.random.key(0), params)
-        assert _same((seen, now), fresh)
-        ended = [step_env(jax.random.key(0), before, action, params)[0] for action in range(env.action_space.n)]
-        assert any(np.array_equal(final, one) for one in ended)
+        assert _alike((seen, now), fresh)
+        assert _alike(final, step_env(jax.random.key(0), before, action, params)[0])
 
 
 def test_reset_to_a_given_layout(env: envs_jax.Environment) -> None:
@@ -137,7 +153,7 @@ def test_a_batch_equals_its_items(env: envs_jax.Environment) -> None:
     reset = _jitted(env, "reset")
     batch = jax.jit(jax.vmap(env.reset, (0, None)))(keys, params)
     for e in range(NUM):
-        assert _same(jax.tree.map(lambda x, e=e: x[e], batch), reset(keys[e], params))
+        assert _alike(jax.tree.map(lambda x, e=e: x[e], batch), reset(keys[e], params))
 
 
 def test_nothing_recompiles(env: envs_jax.Environment) -> None:
@@ -158,6 +174,8 @@ def test_a_resampled_layout_differs_only_where_needed(env: envs_jax.Environment)
     resample = _jitted(env, "resample_layout")
     for seed in range(5):
         assert _same(resample(jax.random.key(seed), layout, jnp.bool_(False), params), layout)
-        assert not _same(resample(jax.random.key(seed), layout, jnp.bool_(True), params), layout)
+        again = resample(jax.random.key(seed), layout, jnp.bool_(True), params)
+        assert _same(again, layout) == (env.name in ONE_LAYOUT)
     # The very draw that gave this layout must be passed over.
-    assert not _same(resample(jax.random.key(6), layout, jnp.bool_(True), params), layout)
+    again = resample(jax.random.key(6), layout, jnp.bool_(True), params)
+    assert _same(again, layout) == (env.name in ONE_LAYOUT)

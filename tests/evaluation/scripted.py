@@ -46,9 +46,10 @@ class Walker(Agent):
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """By index."""
         del view
-        index = jnp.arange(tree.num_nodes)
-        wish = jnp.where(params["last"], index, -index)
-        return jnp.where(open_edges(tree, state), wish.astype(jnp.float32), -FAR), jnp.float32(0), told.ahead
+        num_envs, num_nodes = tree.parent.shape
+        index = jnp.arange(num_nodes)
+        wish = jnp.where(params["last"], index, -index).astype(jnp.float32)
+        return jnp.where(jax.vmap(open_edges)(tree, state), wish, -FAR), jnp.zeros(num_envs), told.ahead
 
     def control(self, params: Params, view: View, told: Instruction) -> tuple[jax.Array, jax.Array]:
         """Minus the steps that remain after each action."""
