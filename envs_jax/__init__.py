@@ -30,11 +30,22 @@ __all__ = [
     "save_layouts",
 ]
 
+
+def _zone(name: str, **overrides: Any) -> Environment:
+    """A preset of Zone. Its module is imported when first asked for: the others are quick to start."""
+    from envs_jax.zone import PRESETS
+
+    return PRESETS[name](**overrides)
+
+
 _REGISTRY: dict[str, Callable[..., Environment]] = {
     "letter": functools.partial(Letter, name="letter"),
     "letter12": functools.partial(Letter, name="letter12", num_letters=12, num_cells=24),
     "walk": functools.partial(Walk, name="walk"),
     "flatworld": flatworld,
+    "zone": functools.partial(_zone, "zone"),
+    "zone-ltl2action": functools.partial(_zone, "zone-ltl2action"),
+    "zone-nm": functools.partial(_zone, "zone-nm"),
 }
 
 
