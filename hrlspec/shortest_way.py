@@ -123,7 +123,7 @@ def shortest_steps(grid: Grid, tree: TaskTree) -> np.ndarray:
 
 
 def shortest_way(grid: Grid, tree: TaskTree, layout: int = 0) -> Way:
-    """A way of :func:`shortest_steps`; among those, straight on comes after the neighbours of lower index.
+    """A way of :func:`shortest_steps`; of several, the one through the neighbours of lowest index.
 
     Args:
         grid: L layouts.
