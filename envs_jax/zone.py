@@ -214,12 +214,12 @@ def lidar_readings(body: jax.Array, zones: jax.Array, gain: float) -> jax.Array:
     bearing = jnp.arctan2(cos * dy - sin * dx, cos * dx + sin * dy)
     place = jnp.where(bearing < 0, bearing + 2 * jnp.pi, bearing) * (LIDAR_BINS / (2 * jnp.pi))
     # Rounding can take a bearing just below a whole turn to the turn itself.
-    bin_index = jnp.minimum(jnp.floor(place), LIDAR_BINS - 1)
-    share = (place - bin_index)[..., None]
+    bin_index = jnp.minimum(jnp.floor(place), LIDAR_BINS - 1)[..., None]
     value = jnp.exp(-gain * jnp.sqrt(dx * dx + dy * dy))[..., None]
-    offset = (np.arange(LIDAR_BINS) - bin_index[..., None]) % LIDAR_BINS
-    seen = jnp.where(offset == 1, share, jnp.where(offset == LIDAR_BINS - 1, 1 - share, offset == 0))
-    return (value * seen).max(-2)
+    before, after = value * (1 - (place[..., None] - bin_index)), value * (place[..., None] - bin_index)
+    bins = np.arange(LIDAR_BINS)
+    near = jnp.where(bin_index == (bins + 1) % LIDAR_BINS, before, jnp.where(bin_index == bins, value, 0.0))
+    return jnp.where(bin_index == (bins - 1) % LIDAR_BINS, after, near).max(-2)
 
 
 def _no_layout() -> ZoneLayout:
