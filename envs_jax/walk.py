@@ -303,16 +303,21 @@ def _regions(env: Walk) -> np.ndarray:
 
 
 def _all_alone(env: Walk, discs: np.ndarray) -> bool:
-    """Whether from every start each proposition can be had alone, over ground without any."""
+    """Whether from every start each proposition can be had alone, with room to stand, over ground without any."""
     start = (env.low, env.low) if env.start is None else env.start
     labels, inside, place = env.grid(WalkLayout(start=np.asarray(start), discs=discs))  # type: ignore[arg-type]
-    pieces, number = ndimage.label(inside & ~labels.any(-1), np.ones((3, 3)))
+    block = np.ones((3, 3), bool)
+    pieces, number = ndimage.label(inside & ~labels.any(-1), block)
     piece = 1 if env.start is None else pieces[tuple(place)]
     if piece == 0 or (env.start is None and number != 1):
         return False
-    near = ndimage.binary_dilation(pieces == piece, np.ones((3, 3)))
-    alone = near & (labels.sum(-1) == 1)
-    return bool((labels & alone[..., None]).any((0, 1)).all())
+    ground = pieces == piece
+    for own in np.moveaxis(labels, -1, 0):
+        alone = own & inside & (labels.sum(-1) == 1)
+        reached = ndimage.binary_propagation(ground, block, mask=ground | alone)
+        if not (ndimage.binary_erosion(alone, block) & reached).any():
+            return False
+    return True
 
 
 def flatworld(**overrides: Any) -> Walk:
