@@ -1,0 +1,208 @@
+"""What the throughput scripts share: rates of the environment, of rollouts and of training, and compile times.
+
+Import it before JAX is first used: it sets the flags that XLA reads then.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib.metadata
+import json
+import os
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from experiments.platform import prepare
+
+prepare()
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import envs_jax
+from experiments.presets import preset, rewards_of
+from hrlspec.agent import Agent
+from hrlspec.curriculum import draw_bank
+from hrlspec.rollout import collect, fill_pool
+from hrlspec.training import Trainer
+
+
+@dataclasses.dataclass(frozen=True)
+class CommonFlags:
+    """What to measure; each script adds its environments."""
+
+    recipes: tuple[Literal["paper", "hrlspec"], ...] = ("paper", "hrlspec")
+    seconds: float = 10.0
+    """At least this long for each figure, compile time apart."""
+    out: Path | None = None
+    """Where the JSON goes besides standard output."""
+    only_start: bool = False
+    """Just build one iteration of the first recipe and print the seconds: what the compile times are made of."""
+
+
+def rate(step: Callable[[Any], Any], carry: Any, steps: int, seconds: float) -> dict[str, float]:
+    """Environment steps/s of ``carry = step(carry)``: median, least and most over its calls, after one warm-up."""
+    carry = jax.block_until_ready(step(carry))
+    rates: list[float] = []
+    start = time.perf_counter()
+    while time.perf_counter() - start < seconds or len(rates) < 3:
+        before = time.perf_counter()
+        carry = jax.block_until_ready(step(carry))
+        rates.append(steps / (time.perf_counter() - before))
+    return {"median": statistics.median(rates), "min": min(rates), "max": max(rates), "calls": len(rates)}
+
+
+def environment(
+    name: str,
+    seconds: float,
+    *,
+    num_envs: int = 1024,
+    num_steps: int = 128,
+    resets: bool = False,
+    redraw: bool = True,
+) -> dict[str, float]:
+    """The bare environment under random actions.
+
+    Args:
+        name: of the preset.
+        seconds: at least this long.
+        num_envs: side by side.
+        num_steps: in one call.
+        resets: whether episodes that end begin anew; otherwise they go on.
+        redraw: whether drawing the actions is part of it; otherwise all calls take the same ones. To draw numbers
+            costs more than a step of the cheapest environments.
+    """
+    env = envs_jax.make(name)
+    params = env.default_params
+    keys = jax.random.split(jax.random.key(0), num_envs)
+    observation, state = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(keys, params)
+    act = jax.vmap(env.step if resets else env.step_env, in_axes=(0, 0, 0, None))
+    shape = (num_steps, num_envs, *env.action_space.shape)
+
+    def draw(key: jax.Array) -> jax.Array:
+        if isinstance(env.action_space, envs_jax.Discrete):
+            return jax.random.randint(key, shape, 0, env.action_space.n)
+        return jax.random.uniform(key, shape, jnp.float32, env.action_space.low, env.action_space.high)
+
+    fixed = None if redraw else draw(jax.random.key(2))
+
+    @jax.jit
+    def roll(carry: Any) -> Any:
+        key, state, seen = carry
+        key, action_key = jax.random.split(key)
+        actions = draw(action_key) if fixed is None else fixed
+        reset_keys = jax.vmap(jax.random.split, (0, None), 1)(keys, num_steps) if resets else None
+
+        def step(carry: Any, inputs: tuple[jax.Array, Any]) -> tuple[Any, None]:
+            state, seen = carry
+            action, step_keys = inputs
+            result = act(keys if step_keys is None else step_keys, state, action, params)
+            # Everything a learner would read is read, or the compiler would leave it out.
+            return (result[1], seen + result[0] + jax.vmap(env.labels, (0, None))(result[1], params).sum()), None
+
+        (state, seen), _ = jax.lax.scan(step, (state, seen), (actions, reset_keys))
+        return key, state, seen
+
+    return rate(roll, (jax.random.key(1), state, observation), num_envs * num_steps, seconds)
+
+
+def training(name: str, recipe: str, seconds: float) -> dict[str, Any]:
+    """Rollout alone, and whole iterations with every technique of the recipe, at the last curriculum level."""
+    env, config, machine = envs_jax.make(name), preset(name, recipe, 1, "ours"), rewards_of(name, 1)
+    agent = Agent(env, config)
+    trainer = Trainer(agent)
+    nothing = np.zeros(0, np.uint32)
+    bank = jax.tree.map(
+        jnp.asarray, draw_bank(np.random.default_rng(0), config.curriculum, env.num_propositions, nothing)
+    )
+    reserved = jnp.zeros(1, jnp.uint32)
+    state = trainer.init(jax.random.key(0), bank, machine)
+    # Some learning first: episodes of an untrained agent are longer, and have fewer decisions.
+    for _ in range(30):
+        state, _ = trainer.iterate(state, bank, machine, reserved)
+    result: dict[str, Any] = {}
+
+    @jax.jit
+    def roll(collector: Any) -> Any:
+        tasks = jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank)
+        book = agent.open_book(state.params, tasks)
+        pool = fill_pool(jax.random.key(1), agent, book, state.curriculum.level, config.episode_slots)
+        return collect(jax.random.key(2), agent, state.params, machine, book, collector, pool)[0]
+
+    result["rollout_steps_per_s"] = rate(roll, state.collector, config.steps_per_iteration, seconds)
+    iterate = functools.partial(_iterate, trainer, bank, machine, reserved)
+    result["training_steps_per_s"] = rate(iterate, state, config.steps_per_iteration, seconds)
+    result["config"] = dataclasses.asdict(config)
+    return result
+
+
+def _iterate(trainer: Trainer, bank: Any, machine: Any, reserved: Any, state: Any) -> Any:
+    return trainer.iterate(state, bank, machine, reserved)[0]
+
+
+def start(name: str, recipe: str) -> dict[str, float]:
+    """Seconds until the training state and the first iteration are there, in this process."""
+    env, config, machine = envs_jax.make(name), preset(name, recipe, 1, "ours"), rewards_of(name, 1)
+    trainer = Trainer(Agent(env, config))
+    bank = draw_bank(np.random.default_rng(0), config.curriculum, env.num_propositions, np.zeros(0, np.uint32))
+    bank = jax.tree.map(jnp.asarray, bank)
+    before = time.perf_counter()
+    state = jax.block_until_ready(trainer.init(jax.random.key(0), bank, machine))
+    between = time.perf_counter()
+    reserved = jnp.zeros(1, jnp.uint32)
+    jax.block_until_ready(trainer.iterate(state, bank, machine, reserved))
+    return {"init_s": between - before, "iteration_s": time.perf_counter() - between}
+
+
+def compile_times(script: str, name: str, recipe: str) -> dict[str, dict[str, float]]:
+    """The same start in two fresh processes: with an empty compilation cache, then with the one it left."""
+    with tempfile.TemporaryDirectory() as cache:
+        command = [sys.executable, "-m", f"benchmarks.{script}", "--env", name, "--recipes", recipe, "--only-start"]
+        environ = os.environ | {"JAX_COMPILATION_CACHE_DIR": cache}
+        runs = [subprocess.run(command, env=environ, check=True, capture_output=True, text=True) for _ in range(2)]
+    cold, warm = (json.loads(run.stdout) for run in runs)
+    return {"cold": cold, "warm": warm}
+
+
+def main(script: str, env: str, flags: CommonFlags, measure: Callable[[], Mapping[str, Any]]) -> None:
+    """Measures and prints one JSON object.
+
+    Args:
+        script: the module's name within this package.
+        env: the preset.
+        flags: what to measure.
+        measure: the entries about the environment alone.
+    """
+    if flags.only_start:
+        print(json.dumps(start(env, flags.recipes[0])))
+        return
+    report: dict[str, Any] = {
+        "benchmark": script,
+        "env": env,
+        "versions": {
+            "python": platform.python_version(),
+            "jax": jax.__version__,
+            "jaxlib": importlib.metadata.version("jaxlib"),
+        },
+        "device": jax.devices()[0].device_kind,
+        "cores": os.cpu_count(),
+        "xla_flags": os.environ.get("XLA_FLAGS", ""),
+        **measure(),
+    }
+    for recipe in flags.recipes:
+        report[recipe] = {"compile": compile_times(script, env, recipe), **training(env, recipe, flags.seconds)}
+    report["peak_memory_mib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    text = json.dumps(report, indent=2)
+    print(text)
+    if flags.out:
+        flags.out.write_text(text + "\n")
