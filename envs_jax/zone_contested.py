@@ -1,0 +1,155 @@
+"""Layouts of Zone that tell an agent that looks ahead from one that takes the nearest zone.
+
+The task they are for is "first colour, then second". On a contested layout the nearer zone of the first colour lies
+away from the only goal that is close to the other one, so that starting with the nearest makes the whole way longer.
+On its mirrored control both zones of the first colour are reflected through the robot: now the nearer one is right.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from envs_jax.zone_layouts import COLOURS, MOST_DRAWS, SPAWN, ZONE_KEEPOUT, ZONES_EACH, ZoneLayout
+
+ROBOT_WITHIN = 0.3
+"""The robot starts this close to the middle along each axis (m)."""
+GOAL_DISTANCE = (1.8, 2.4)
+BETTER_SHARE = (0.5, 0.7)
+"""Where the better first zone lies on the straight way to the goal, as a share of it."""
+NEARER_DISTANCE = (0.8, 1.2)
+APART = 1.0
+"""Least distance between any two zones (m)."""
+LEAST_DETOUR = 0.5
+"""How much longer the way over the worse first zone is at least (m)."""
+CLEARANCE = 0.55
+"""Least distance of the other zones from the straight ways between robot, first zones and goal (m)."""
+
+_MOST_TURN = 0.5
+"""The nearer zone is not exactly opposite the goal, but within this angle of it (rad)."""
+_NEARER_BY = 0.1
+"""The nearer zone is nearer by this much at least (m)."""
+_GEOMETRIES = 128
+"""Draws of the contest at once; a valid one is among them 99 % of the time."""
+_REACH = SPAWN - ZONE_KEEPOUT
+
+
+@struct.dataclass
+class _Core:
+    """What the contest is about."""
+
+    robot: jax.Array  # [2]
+    better: jax.Array  # [2], of the first colour
+    nearer: jax.Array  # [2], of the first colour
+    goal: jax.Array  # [2], of the second colour
+
+
+def contested_layout(
+    key: jax.Array, first: jax.Array | int, second: jax.Array | int, mirrored: jax.Array | bool = False
+) -> ZoneLayout:
+    """A random contested layout, or with the same key its mirrored control. The key is consumed.
+
+    Args:
+        key: decides everything but the colours and the reflection.
+        first: int ``[]``, index of the colour to go to first.
+        second: int ``[]``, index of the colour to go to then; another one.
+        mirrored: bool ``[]``, whether the control is wanted.
+
+    Returns:
+        The layout. ``zones[first, 0]`` is the better zone of the first colour, ``zones[first, 1]`` the other, and
+        ``zones[second, 0]`` the goal; so the nearer zone of the first colour is number 1, or 0 on the control.
+    """
+
+    def attempt(carry: tuple[jax.Array, _Core, jax.Array, jax.Array]) -> tuple[jax.Array, _Core, jax.Array, jax.Array]:
+        key, core_key, rest_key = jax.random.split(carry[0], 3)
+        core, found = _draw_core(core_key)
+        rest, placed = _draw_rest(rest_key, core)
+        return key, core, rest, found & placed
+
+    heading_key, key = jax.random.split(key)
+    heading = jax.random.uniform(heading_key, (), maxval=2 * jnp.pi)
+    nowhere = jnp.zeros(2)
+    start = (key, _Core(nowhere, nowhere, nowhere, nowhere), jnp.zeros((5, 2)), jnp.bool_(False))
+    _, core, rest, _ = jax.lax.while_loop(lambda carry: ~carry[3], attempt, start)
+
+    pair = jnp.stack([core.better, core.nearer])
+    reflected = 2 * core.robot - pair[::-1]
+    index = jnp.arange(len(COLOURS))
+    other = (index != first) & (index != second)
+    zones = rest[1:].reshape(-1, ZONES_EACH, 2)[jnp.clip(jnp.cumsum(other) - 1, 0, 1)]
+    zones = jnp.where((index == first)[:, None, None], jnp.where(mirrored, reflected, pair), zones)
+    zones = jnp.where((index == second)[:, None, None], jnp.stack([core.goal, rest[0]]), zones)
+    return ZoneLayout(robot=jnp.concatenate([core.robot, heading[None]]), zones=zones)
+
+
+def _draw_core(key: jax.Array) -> tuple[_Core, jax.Array]:
+    """Robot, goal and the two zones of the first colour, and whether a valid draw was found (bool ``[]``)."""
+
+    def draw(key: jax.Array) -> tuple[_Core, jax.Array]:
+        keys = jax.random.split(key, 6)
+        robot = jax.random.uniform(keys[0], (2,), minval=-ROBOT_WITHIN, maxval=ROBOT_WITHIN)
+        distance = jax.random.uniform(keys[1], (), minval=GOAL_DISTANCE[0], maxval=GOAL_DISTANCE[1])
+        better = distance * jax.random.uniform(keys[2], (), minval=BETTER_SHARE[0], maxval=BETTER_SHARE[1])
+        nearer = jax.random.uniform(keys[3], (), minval=NEARER_DISTANCE[0], maxval=NEARER_DISTANCE[1])
+        angle = jax.random.uniform(keys[4], (), maxval=2 * jnp.pi)
+        turned = angle + jax.random.uniform(keys[5], (), minval=-_MOST_TURN, maxval=_MOST_TURN)
+        ahead = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+        back = -jnp.stack([jnp.cos(turned), jnp.sin(turned)])
+        goal = robot + distance * ahead
+        core = _Core(robot=robot, better=robot + better * ahead, nearer=robot + nearer * back, goal=goal)
+        zones = jnp.stack([core.goal, core.better, core.nearer, *_reflected(core)])
+        # The control must do as well, so its zones keep their distances too.
+        apart = jnp.stack([_distance(zone, core.goal) for zone in zones[1:]]).min() >= APART
+        return core, apart & (jnp.abs(zones) <= _REACH).all() & (nearer + _NEARER_BY <= better)
+
+    cores, valid = jax.vmap(draw)(jax.random.split(key, _GEOMETRIES))
+    return jax.tree.map(lambda x: x[jnp.argmax(valid)], cores), valid.any()
+
+
+def _draw_rest(key: jax.Array, core: _Core) -> tuple[jax.Array, jax.Array]:
+    """The other zone of the second colour and those of the other two ``[5, 2]``, and whether all found a place.
+
+    They keep away from the first zones' reflections as well, so that a contested layout and its control share them.
+    """
+    near, far = _reflected(core)
+    placed = jnp.stack([core.goal, core.better, core.nearer, near, far])
+    found, rest = jnp.bool_(True), []
+    for place_key in jax.random.split(key, 5):
+        candidates = jax.random.uniform(place_key, (MOST_DRAWS, 2), minval=-_REACH, maxval=_REACH)
+        free = (_distance(candidates[:, None], placed) >= 2 * ZONE_KEEPOUT).all(-1)
+        if not rest:
+            free &= _is_contested(core, candidates)
+        for end in (core.goal, core.nearer, far):
+            free &= _distance_to_way(candidates, core.robot, end) >= CLEARANCE
+        rest.append(candidates[jnp.argmax(free)])
+        placed = jnp.concatenate([placed, rest[-1][None]])
+        found &= free.any()
+    return jnp.stack(rest), found
+
+
+def _is_contested(core: _Core, other_goal: jax.Array) -> jax.Array:
+    """Whether the better zone makes the whole way shorter here and on the control; bool ``[...]`` for ``[..., 2]``."""
+
+    def way(over: jax.Array) -> jax.Array:
+        onward = jnp.minimum(_distance(over, core.goal), _distance(over, other_goal))
+        return _distance(core.robot, over) + onward
+
+    near, far = _reflected(core)
+    return (way(core.better) + LEAST_DETOUR <= way(core.nearer)) & (way(near) + LEAST_DETOUR <= way(far))
+
+
+def _reflected(core: _Core) -> tuple[jax.Array, jax.Array]:
+    """The first zones of the control: the nearer one, now on the goal's side, and the other."""
+    return 2 * core.robot - core.nearer, 2 * core.robot - core.better
+
+
+def _distance(left: jax.Array, right: jax.Array) -> jax.Array:
+    return jnp.sqrt(((left - right) ** 2).sum(-1))
+
+
+def _distance_to_way(points: jax.Array, start: jax.Array, end: jax.Array) -> jax.Array:
+    """Distance of points ``[..., 2]`` from a straight way."""
+    along = end - start
+    share = jnp.clip(((points - start) * along).sum(-1) / (along**2).sum(), 0.0, 1.0)
+    return _distance(points, start + share[..., None] * along)
