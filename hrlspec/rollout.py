@@ -46,6 +46,7 @@ class Trajectory:
     truncated: jax.Array  # bool
     bootstrap: jax.Array  # float32, low level's value after; where truncated and at T - 1
     plan_bootstrap: jax.Array  # float32, planner's value after; likewise
+    reach_value: jax.Array  # float32 [..., P], reach critic's value after, before any reset; empty without a shield
     satisfied: jax.Array  # bool
     level: jax.Array  # int32, curriculum level of the task
 
@@ -135,6 +136,11 @@ def collect(
             jax.random.split(keys[2], config.num_steps),
         )
 
+    def reach_value(params: Params, view: View) -> jax.Array:
+        if config.shield.mode == "off":
+            return jnp.zeros((num_envs, 0))
+        return jax.vmap(agent.reach_values, in_axes=(None, 0))(params, view).max(-1)
+
     def step(collector: Collector, inputs: tuple[jax.Array, ...]) -> tuple[Collector, Trajectory]:
         plan_noise, noise, keys = inputs
         before, decision = collector.worker, collector.decision
@@ -173,6 +179,7 @@ def collect(
             truncated=outcome.truncated,
             bootstrap=plan_value[num_envs:],
             plan_bootstrap=plan_value[num_envs:],
+            reach_value=reach_value(params, worker.view),
             satisfied=outcome.satisfied,
             level=collector.level,
         )

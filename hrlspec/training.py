@@ -188,7 +188,7 @@ class Trainer:
                 epochs=1,
                 minibatches=config.shield.minibatches,
             )
-            batch = reach_batch(agent, state.params, trajectory)
+            batch = reach_batch(agent, trajectory)
             train("reach_critic", keys[2], batch, settings, reach_loss)
         return params, optimisers, metrics
 
@@ -263,19 +263,14 @@ def _distance(x: jax.Array, y: jax.Array) -> jax.Array:
     return jnp.sqrt(((x - y) ** 2).sum(-1) + 1e-8)
 
 
-def reach_batch(agent: Agent, params: Params, trajectory: Trajectory) -> tuple[Any, ...]:
-    """Q-learning data for all goals from every transition, leading axis E·T.
+def reach_batch(agent: Agent, trajectory: Trajectory) -> tuple[Any, ...]:
+    """Q-learning data for all goals from every transition, leading axes E, T.
 
-    The target is 1 where the goal holds after the step, else discount · max_a Q(s', g, a). At an episode's
-    end s' is another episode's first state, so only goals that were reached count there.
+    The target is 1 where the goal holds after the step, else discount · max_a Q(s', g, a): the end of a task is not the
+    end of the world in which its other letters can be reached.
     """
-    values = jax.vmap(jax.vmap(lambda v: agent.reach_values(params, v).max(-1)))(trajectory.view)
-    ended = (trajectory.terminated | trajectory.truncated).at[-1].set(True)
-    ahead = agent.config.shield.discount * jnp.roll(values, -1, axis=0)
-    target = jnp.where(trajectory.labels, 1.0, ahead)
-    known = trajectory.labels | ~ended[..., None]
-    batch = trajectory.view, trajectory.action, target, known
-    return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), batch)
+    target = jnp.where(trajectory.labels, 1.0, agent.config.shield.discount * trajectory.reach_value)
+    return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (trajectory.view, trajectory.action, target))
 
 
 def reach_loss(
@@ -283,9 +278,9 @@ def reach_loss(
 ) -> tuple[jax.Array, Metrics]:
     """Squared error of Q(s, g, a) for all goals g (paper, "Avoiding Propositions")."""
     del settings, entropy_weight
-    view, action, target, known = jax.tree.map(flat, batch)
+    view, action, target = jax.tree.map(flat, batch)
     values = jax.vmap(lambda v, a: agent.reach_values({"reach_critic": params}, v)[:, a])(view, action)
-    loss = ppo.masked_mean((values - target) ** 2, known)
+    loss = ((values - target) ** 2).mean()
     return loss, {"value_loss": loss}
 
 

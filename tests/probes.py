@@ -136,7 +136,7 @@ def small_config(**changes: Any) -> Config:
         planner_share=4,
         group=8,
         low=dataclasses.replace(ppo, entropy=0.05, final_entropy=0.01),
-        high=dataclasses.replace(ppo, entropy=0.01, final_entropy=0.002),
+        high=dataclasses.replace(ppo, entropy=0.05, final_entropy=0.01),
         network=NetworkConfig(
             latent=16,
             conv_channels=(),

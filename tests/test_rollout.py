@@ -253,6 +253,15 @@ def test_actions_values_and_the_shield(book: TaskBook, t: Trajectory) -> None:
             )
 
 
+def test_reach_values_are_of_the_state_after_the_step(t: Trajectory) -> None:
+    """Also where the episode ended there, and the next one's first state is what is seen next."""
+    value = np.asarray(quick_jit(jax.vmap(AGENT.reach_values, (None, 0)))(params(), flat(t.view))).max(-1)
+    value = value.reshape(T, E, -1)
+    goes_on = ~(t.terminated | t.truncated)[:-1]
+    np.testing.assert_allclose(t.reach_value[:-1][goes_on], value[1:][goes_on], atol=1e-5)
+    assert (np.abs(t.reach_value[:-1] - value[1:])[~goes_on] > 1e-3).any()
+
+
 def states(t: Trajectory, node: np.ndarray, blocked: np.ndarray) -> TaskState:
     return TaskState(node=node.ravel(), blocked=blocked.reshape(T * E, -1), status=np.zeros(T * E, np.int32))
 

@@ -178,7 +178,6 @@ def test_level_two_is_reached() -> None:
     [
         ("achieve a", {1: 1, 2: 2, 3: 3}),
         ("a ensuring not b", {1: 1, 2: 2, 3: 3}),
-        ("a or b", {1: 1, 2: 2, 3: 1}),
         ("a; b", {1: 5, 2: 6, 3: 7}),
         ("(a or b); c", {1: 4, 2: 3, 3: 2}),  # from 1 the nearest goal is the wrong one
     ],
@@ -196,10 +195,32 @@ def test_greedy_episodes_are_as_short_as_can_be(name: str, best: dict[int, int])
     assert result.steps.tolist() == list(best.values()) * 2
 
 
+@dataclasses.dataclass(frozen=True)
+class Obedient(Agent):
+    """Walks straight to what its sub-task reaches. A low level that learns may go elsewhere when that pays more."""
+
+    def control(self, params: Any, view: Any, told: Any) -> tuple[jax.Array, jax.Array]:
+        planes, here = view
+        cells = jnp.arange(here.shape[0])
+        right = (told.reach @ planes @ cells) > here @ cells
+        return jnp.where(right, 10.0, -10.0) * jnp.array([-1.0, 1.0]), super().control(params, view, told)[1]
+
+
+@functools.cache
+def planner_trained() -> TrainState:
+    """120 iterations with an obedient low level and no shield, so that only the planner's choice counts."""
+    config = dataclasses.replace(CONFIG, shield=dataclasses.replace(CONFIG.shield, mode="off"))
+    trainer = Trainer(Obedient(ENV, config))
+    state, step = quick_jit(trainer.init)(jax.random.key(0), bank(), machine()), quick_jit(trainer.iterate)
+    for _ in range(120):
+        state, _ = step(state, bank(), machine(), NOTHING_RESERVED)
+    return state
+
+
 @functools.cache
 def planner_at(name: str) -> tuple[np.ndarray, np.ndarray]:
     """Probabilities ``[3, N]`` and values ``[3]`` from cells 1, 2 and 3."""
-    params, agent, tree = trained()[0].params, TRAINER.agent, on_device(task(name))
+    params, agent, tree = planner_trained().params, TRAINER.agent, on_device(task(name))
 
     def one(view: Any) -> Any:
         logits, value = agent.plan(params, view, tree, initial(tree), agent.instruct(params, tree))
@@ -208,7 +229,6 @@ def planner_at(name: str) -> tuple[np.ndarray, np.ndarray]:
     return jax.tree.map(np.asarray, quick_jit(jax.vmap(one))(ENV.view_at(np.array([1, 2, 3]))))
 
 
-@pytest.mark.slow
 def test_the_planner_picks_the_shorter_branch() -> None:
     for name, nearest in (("a or b", 1), ("b or a", 2)):
         chosen, _ = planner_at(name)
@@ -218,7 +238,6 @@ def test_the_planner_picks_the_shorter_branch() -> None:
     assert (chosen[:, 2] > 0.8).all()  # b lies on the way to c
 
 
-@pytest.mark.slow
 def test_the_planner_knows_the_values() -> None:
     """γ^(steps - 1), the return of the best branch."""
     np.testing.assert_allclose(planner_at("achieve a")[1], GAMMA ** np.array([0, 1, 2]), atol=0.12)
@@ -251,15 +270,17 @@ def test_the_reach_critic_learns_the_distance() -> None:
         action, here = rng.integers(2, size=(32, 16)), [rng.integers(len(ENV.cells), size=16)]
         for a in action:
             here.append(np.clip(here[-1] + 2 * a - 1, 0, len(ENV.cells) - 1))
-        ended = rng.random((32, 16)) < 0.1
-        flags = {"terminated": ended, "truncated": ended & False, "labels": ENV.table[np.stack(here[1:])]}
-        return Trajectory(**{**blank, **flags, "action": action, "view": ENV.view_at(np.stack(here[:-1]))})
+        labels, view = ENV.table[np.stack(here[1:])], ENV.view_at(np.stack(here))
+        return Trajectory(**{**blank, "labels": labels, "action": action, "view": view})
 
     @quick_jit
     def fit(params: Any, state: Any, walks: Trajectory) -> Any:
         def fit_one(carry: Any, trajectory: Trajectory) -> Any:
             params, state = carry
-            batch = training.reach_batch(agent, {"reach_critic": params}, trajectory)
+            values = jax.vmap(jax.vmap(lambda view: agent.reach_values({"reach_critic": params}, view).max(-1)))
+            before, after = (jax.tree.map(lambda x, s=s: x[s], trajectory.view) for s in (slice(-1), slice(1, None)))
+            trajectory = trajectory.replace(view=before, reach_value=values(after))
+            batch = training.reach_batch(agent, trajectory)
 
             def loss(p: Any) -> Any:
                 return training.reach_loss(agent, p, batch, settings, jnp.float32(0))
