@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from envs_jax.zone_layouts import COLOURS, MOST_DRAWS, SPAWN, ZONE_KEEPOUT, ZONES_EACH, ZoneLayout
@@ -85,26 +86,31 @@ def contested_layout(
 
 def _draw_core(key: jax.Array) -> tuple[_Core, jax.Array]:
     """Robot, goal and the two zones of the first colour, and whether a valid draw was found (bool ``[]``)."""
+    # All numbers in one draw, for one call of the generator: it is what drawing a layout costs.
+    unit = jax.random.uniform(key, (_GEOMETRIES, 7))
 
-    def draw(key: jax.Array) -> tuple[_Core, jax.Array]:
-        keys = jax.random.split(key, 6)
-        robot = jax.random.uniform(keys[0], (2,), minval=-ROBOT_WITHIN, maxval=ROBOT_WITHIN)
-        distance = jax.random.uniform(keys[1], (), minval=GOAL_DISTANCE[0], maxval=GOAL_DISTANCE[1])
-        better = distance * jax.random.uniform(keys[2], (), minval=BETTER_SHARE[0], maxval=BETTER_SHARE[1])
-        nearer = jax.random.uniform(keys[3], (), minval=NEARER_DISTANCE[0], maxval=NEARER_DISTANCE[1])
-        angle = jax.random.uniform(keys[4], (), maxval=2 * jnp.pi)
-        turned = angle + jax.random.uniform(keys[5], (), minval=-_MOST_TURN, maxval=_MOST_TURN)
-        ahead = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-        back = -jnp.stack([jnp.cos(turned), jnp.sin(turned)])
-        goal = robot + distance * ahead
-        core = _Core(robot=robot, better=robot + better * ahead, nearer=robot + nearer * back, goal=goal)
-        zones = jnp.stack([core.goal, core.better, core.nearer, *_reflected(core)])
-        # The control must do as well, so its zones keep their distances too.
-        apart = jnp.stack([_distance(zone, core.goal) for zone in zones[1:]]).min() >= APART
-        return core, apart & (jnp.abs(zones) <= _REACH).all() & (nearer + _NEARER_BY <= better)
+    def between(column: int, limits: tuple[float, float]) -> jax.Array:
+        return limits[0] + (limits[1] - limits[0]) * unit[:, column]
 
-    cores, valid = jax.vmap(draw)(jax.random.split(key, _GEOMETRIES))
-    return jax.tree.map(lambda x: x[jnp.argmax(valid)], cores), valid.any()
+    robot = ROBOT_WITHIN * (2 * unit[:, :2] - 1)
+    distance, nearer = between(2, GOAL_DISTANCE), between(3, NEARER_DISTANCE)
+    better = distance * between(4, BETTER_SHARE)
+    angle = between(5, (0.0, 2 * np.pi))
+    turned = angle + between(6, (-_MOST_TURN, _MOST_TURN))
+    ahead = jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)
+    back = -jnp.stack([jnp.cos(turned), jnp.sin(turned)], -1)
+    core = _Core(
+        robot=robot,
+        better=robot + better[:, None] * ahead,
+        nearer=robot + nearer[:, None] * back,
+        goal=robot + distance[:, None] * ahead,
+    )
+    # The control must do as well, so its zones keep their distances too.
+    zones = jnp.stack([core.better, core.nearer, *_reflected(core)])
+    valid = (_distance(zones, core.goal) >= APART).all(0) & (nearer + _NEARER_BY <= better)
+    valid &= (jnp.abs(zones) <= _REACH).all((0, 2)) & (jnp.abs(core.goal) <= _REACH).all(-1)
+    best = jnp.argmax(valid)
+    return jax.tree.map(lambda x: x[best], core), valid.any()
 
 
 def _draw_rest(key: jax.Array, core: _Core) -> tuple[jax.Array, jax.Array]:
@@ -114,9 +120,9 @@ def _draw_rest(key: jax.Array, core: _Core) -> tuple[jax.Array, jax.Array]:
     """
     near, far = _reflected(core)
     placed = jnp.stack([core.goal, core.better, core.nearer, near, far])
-    found, rest = jnp.bool_(True), []
-    for place_key in jax.random.split(key, 5):
-        candidates = jax.random.uniform(place_key, (MOST_DRAWS, 2), minval=-_REACH, maxval=_REACH)
+    found = jnp.bool_(True)
+    rest: list[jax.Array] = []
+    for candidates in jax.random.uniform(key, (5, MOST_DRAWS, 2), minval=-_REACH, maxval=_REACH):
         free = (_distance(candidates[:, None], placed) >= 2 * ZONE_KEEPOUT).all(-1)
         if not rest:
             free &= _is_contested(core, candidates)
