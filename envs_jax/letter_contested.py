@@ -41,10 +41,7 @@ def myopia_regret(layout: jax.Array, num_letters: int) -> jax.Array:
 
 
 def most_contested(key: jax.Array, regret: jax.Array, tries: int) -> tuple[jax.Array, jax.Array]:
-    """The pair of different letters with the largest regret among ``tries`` random ones (repeats allowed), int32 ``[]``.
-
-    The key is consumed.
-    """
+    """The pair of letters with the largest regret among ``tries`` random ones, int32 ``[]`` each. Consumes the key."""
     num_letters = regret.shape[0]
     keys = jax.random.split(key)
     first = jax.random.randint(keys[0], (tries,), 0, num_letters)

@@ -64,7 +64,7 @@ class RunFlags:
     --config.* shows the preset of the chosen environment, method, recipe and reward set, and overrides it.
     """
 
-    env: Literal["letter", "letter12"] = "letter"
+    env: Literal["letter", "letter12", "walk", "flatworld", "zone", "zone-ltl2action", "zone-nm"] = "letter"
     method: Method = "ours"
     """myopic-low: the low level does not see what comes after its sub-task; no-er: no relabelled experience."""
     recipe: Recipe = "hrlspec"

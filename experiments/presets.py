@@ -8,8 +8,15 @@ import envs_jax
 from hrlspec.config import Config, CurriculumConfig, NetworkConfig, PPOConfig, RelabelConfig, ShieldConfig
 from hrlspec.rewards import Bonus, RewardMachine, reward_machine
 
-# Letter's order bonuses (paper, "Reward Function of Subgoals").
-_BONUSES = (Bonus("a", "d", 5.0), Bonus("b", "e", 10.0, ("a",)))
+# Order bonuses of the paper's worlds (paper, "Reward Function of Subgoals"); Letter's serve where it gives none.
+_LETTER_BONUSES = (Bonus("a", "d", 5.0), Bonus("b", "e", 10.0, ("a",)))
+_BONUSES = {
+    "letter": _LETTER_BONUSES,
+    "letter12": _LETTER_BONUSES,
+    "walk": (Bonus("d", "b", 5.0, ("e",)), Bonus("b", "c", 10.0, ("a",))),
+    "flatworld": (),
+    "zone": (Bonus("green", "red", 10.0), Bonus("red", "blue", 20.0, ("yellow",))),
+}
 
 
 def preset(env_name: str, recipe: str, reward_set: int, method: str) -> Config:
@@ -22,8 +29,7 @@ def preset(env_name: str, recipe: str, reward_set: int, method: str) -> Config:
         method: ``ours``, ``myopic-low`` or ``no-er``.
     """
     config = Config() if recipe == "paper" else hrlspec()
-    if env_name == "letter12":
-        config = letter12(config)
+    config = _WORLDS.get(env_name, lambda config: config)(config)
     if reward_set == 2:
         # Returns reach 18; and a bonus at the end of a long branch must outweigh a short one.
         config = dataclasses.replace(config, value_scale=5.0, discount=0.97)
@@ -76,9 +82,48 @@ def letter12(config: Config) -> Config:
     )
 
 
+def walk(config: Config) -> Config:
+    """A point that moves a tenth of a unit a step: episodes of hundreds of steps, and a decision in fifty."""
+    return dataclasses.replace(
+        config,
+        total_steps=2_000_000,
+        discount=0.99,
+        num_envs=256,
+        num_steps=128,
+        planner_share=64,
+        low=dataclasses.replace(config.low, learning_rate=1e-3, minibatches=32, entropy=0.003, final_entropy=0.0),
+        network=dataclasses.replace(config.network, encoder_mlp=(128, 128), planner_features=32),
+    )
+
+
+def zone(config: Config) -> Config:
+    """A robot with inertia: episodes of up to 1,000 steps, zones seen through a lidar."""
+    return dataclasses.replace(
+        config,
+        total_steps=10_000_000,
+        discount=0.998,
+        num_envs=256,
+        num_steps=128,
+        planner_share=64,
+        low=dataclasses.replace(config.low, learning_rate=7e-4, minibatches=32, entropy=0.003, final_entropy=0.0),
+        network=dataclasses.replace(config.network, latent=128, encoder_mlp=(128, 128)),
+        curriculum=dataclasses.replace(config.curriculum, levels=3, max_avoid=2),
+    )
+
+
+_WORLDS = {
+    "letter12": letter12,
+    "walk": walk,
+    "flatworld": walk,
+    "zone": zone,
+    "zone-ltl2action": zone,
+    "zone-nm": zone,
+}
+
+
 def rewards_of(env_name: str, reward_set: int) -> RewardMachine:
     """The rewards of a reward set: 1 for completion; in set 2 also for sub-tasks and for orders of letters."""
     propositions = envs_jax.make(env_name).propositions
     if reward_set == 1:
         return reward_machine(propositions)
-    return reward_machine(propositions, subtask=1.0, bonuses=_BONUSES)
+    return reward_machine(propositions, subtask=1.0, bonuses=_BONUSES[env_name.split("-")[0]])

@@ -109,6 +109,24 @@ _DAG = Recipe(
     lambda trees: _shortest(trees) >= 2,
 )
 
+_ZONE_DAG = Recipe(
+    "random trees, depth 2 and 3 in equal numbers, 1 to 3 children of a node, 0 to 2 negatives on an edge; "
+    "every way to satisfy a task takes 2 sub-tasks or more",
+    tuple(_trees(depth) for depth in (2, 3)),
+    lambda trees: _shortest(trees) >= 2,
+)
+_REACH_AVOID = Recipe(
+    "sequences of 2 to 6 sub-tasks in equal numbers, 1 or 2 negatives on each (tasks of one sub-task are too few to hold "
+    "any of them out)",
+    tuple(_sequences(level, max_avoid=2, num_drawn=40 * NUM_TASKS) for level in range(2, 7)),
+    _always_avoids,
+)
+_REACH = Recipe(
+    "sequences of 4, 6, 8, 10 and 12 sub-tasks in equal numbers, without negatives (of 2 and 3 there are too few to hold "
+    "them out)",
+    tuple(_sequences(level, max_avoid=0, num_drawn=4 * NUM_TASKS) for level in (4, 6, 8, 10, 12)),
+)
+
 RECIPES: dict[str, dict[str, Recipe]] = {
     "letter": {
         "dag": _DAG,
@@ -144,6 +162,11 @@ RECIPES: dict[str, dict[str, Recipe]] = {
             (_sequences(12, max_avoid=0, num_drawn=2 * NUM_TASKS),),
         ),
     },
+    "walk": {"dag": _DAG, "reach_avoid": _REACH_AVOID, "reach": _REACH},
+    "flatworld": {"dag": _DAG, "reach_avoid": _REACH_AVOID, "reach": _REACH},
+    "zone": {"dag": _ZONE_DAG, "reach_avoid": _REACH_AVOID, "reach": _REACH},
+    "zone-ltl2action": {"dag": _ZONE_DAG},
+    "zone-nm": {"dag": _ZONE_DAG},
 }
 
 

@@ -1,6 +1,7 @@
 """The agent: its networks and the pure functions that act with them.
 
-Axes: **E** environments, **N** tree nodes, **P** atomic propositions, **F** features, **A** actions, **M** tasks.
+Axes: **E** environments, **B** those of a batch, **N** tree nodes, **W** ways to a leaf, **P** atomic propositions,
+**F** features, **K** candidate actions, **M** tasks.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from envs_jax import Discrete, Environment
+from envs_jax import Environment
+from hrlspec.actions import Distribution, distribution_over
 from hrlspec.config import Config
 from hrlspec.networks.controller import Controller, Instruction
 from hrlspec.networks.planner import Planner
@@ -24,7 +26,7 @@ from hrlspec.spec import TaskState, TaskTree, initial, open_edges
 
 View = tuple[jax.Array, jax.Array]
 Params = dict[str, Any]
-Estimate = tuple[jax.Array, jax.Array]  # logits and value
+Estimate = tuple[jax.Array, jax.Array]  # policy outputs and value
 
 
 @struct.dataclass
@@ -52,13 +54,10 @@ class Agent:
     env: Environment
     config: Config
 
-    @property
-    def num_actions(self) -> int:
-        """A. Only discrete actions are supported."""
-        space = self.env.action_space
-        if not isinstance(space, Discrete):
-            raise TypeError(f"the agent needs a discrete action space, {self.env.name} has {space}")
-        return space.n
+    @functools.cached_property
+    def actions(self) -> Distribution:
+        """What the low level's policy is a distribution over."""
+        return distribution_over(self.env.action_space)
 
     @functools.cached_property
     def planner(self) -> Planner:
@@ -68,12 +67,12 @@ class Agent:
     @functools.cached_property
     def controller(self) -> Controller:
         """The low level."""
-        return Controller(self.config.network, self.num_actions)
+        return Controller(self.config.network, self.actions.num_outputs)
 
     @functools.cached_property
     def reach_critic(self) -> ReachCritic:
         """The critic behind the shield."""
-        return ReachCritic(self.config.network.reach_critic, self.num_actions)
+        return ReachCritic(self.config.network.reach_critic, self.actions)
 
     def init(self, key: jax.Array) -> Params:
         """Fresh parameters: ``planner``, ``controller``, ``reach_critic``. The key is consumed."""
@@ -159,12 +158,16 @@ class Agent:
         return edge, leaf < num_nodes, some
 
     def control(self, params: Params, view: View, told: Instruction) -> tuple[jax.Array, jax.Array]:
-        """The low level on one environment: action logits ``[A]`` and value ``[]``."""
+        """The low level on one environment: what describes its policy (``actions``) and the value ``[]``."""
         return cast(Estimate, self.controller.apply(params["controller"], view, told))
 
     def reach_values(self, params: Params, view: View) -> jax.Array:
-        """Q(s, g, a) of reaching each proposition, float32 ``[P, A]``."""
+        """Q(s, g, a) of reaching each proposition by each candidate action, float32 ``[P, K]``."""
         return cast(jax.Array, self.reach_critic.apply(params["reach_critic"], view))
+
+    def reach_values_of(self, params: Params, view: View, action: jax.Array) -> jax.Array:
+        """Q(s, g, a) of reaching each proposition by one action, float32 ``[P]``."""
+        return cast(jax.Array, self.reach_critic.apply(params["reach_critic"], view, action, method="of"))
 
 
 def _weigh(
@@ -178,26 +181,25 @@ def _weigh(
     return advice, jnp.where(mine.any(1)[:, None, None], way_ahead[score.argmax(1)], told_ahead)
 
 
-def sample(logits: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Gumbel-max sample from unbatched logits ``[A]`` and its log-probability; zero noise gives the mode."""
-    choice = jnp.argmax(logits + noise).astype(jnp.int32)
-    return choice, jax.nn.log_softmax(logits)[choice]
-
-
 def shielded_action(agent: Agent, params: Params, view: View, avoid: jax.Array, action: jax.Array) -> jax.Array:
     """Replaces an action that would step on a forbidden proposition (paper, "Avoiding Propositions").
 
     With k = argmax over p₋ of V(s, g_k): if V(s, g_k) > ν, the action becomes argmin_a Q(s, g_k, a). In mode
-    ``action`` this happens only where the chosen action itself has some Q(s, g, action) > ν.
+    ``action`` this happens only where the chosen action itself has some Q(s, g, action) > ν. Maxima and minima are over
+    the candidates: exact for discrete actions.
     """
     shield = agent.config.shield
     if shield.mode == "off":
         return action
     values = jnp.where(avoid[:, None], agent.reach_values(params, view), 0.0)
-    danger = values.max(-1) if shield.mode == "state" else values[:, action]
+    if shield.mode == "state":
+        danger = values.max(-1)
+    else:
+        danger = jnp.where(avoid, agent.reach_values_of(params, view, action), 0.0)
     nearest = jnp.argmax(danger)
     away = values[nearest] if shield.mode == "state" else values.max(0)
-    return jnp.where(danger[nearest] > shield.threshold, jnp.argmin(away), action).astype(jnp.int32)
+    safest = agent.actions.candidates()[jnp.argmin(away)]
+    return jnp.where(danger[nearest] > shield.threshold, safest, action)
 
 
 def in_groups(function: Callable[[Any], Any], needed: jax.Array, inputs: Any, outputs: Any, group: int) -> Any:

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from hrlspec.actions import Categorical
 from hrlspec.agent import Agent, Params, TaskBook, View, in_groups
 from hrlspec.config import Config
 from hrlspec.relabel import Record, Relabelled, relabel
@@ -33,7 +34,7 @@ class LowBatch:
     slot: jax.Array  # int32, which of the trees
     edge: jax.Array  # int32, the assigned edge
     ahead: jax.Array  # float32 [..., D, P], what was to be reached after it
-    action: jax.Array  # int32
+    action: jax.Array  # int32, or float32 [..., A]
     log_prob: jax.Array  # float32, at the start of the update, under this task
     advantage: jax.Array  # float32
     target: jax.Array  # float32
@@ -198,15 +199,16 @@ def _copies(
         on_path = later <= new.path_length.reshape(-1)[row][:, None]
         ahead = fresh.tree.reach[row[:, None], jnp.minimum(later, num_nodes - 1)] & on_path[..., None]
         told = dataclasses.replace(told, ahead=ahead.astype(jnp.float32))
-    logits, value = jax.vmap(agent.control, in_axes=(None, 0, 0))(params, view, told)
-    log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), rollout.action.reshape(-1, 1), 1)[:, 0]
+    outputs, value = jax.vmap(agent.control, in_axes=(None, 0, 0))(params, view, told)
+    action = rollout.action.reshape((copies * num_steps, *rollout.action.shape[2:]))
+    log_prob = jax.vmap(agent.actions.log_prob)(outputs, action)
 
     def plan(inputs: tuple[View, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         view, row, node, edge = inputs
         tree, told = jax.tree.map(lambda x: x[row], (fresh.tree, fresh.told))
         state = dataclasses.replace(jax.vmap(initial)(tree), node=node)
         logits, value, _ = agent.plan_ahead(params, view, tree, state, told)
-        return jnp.take_along_axis(jax.nn.log_softmax(logits), edge[:, None], 1)[:, 0], value
+        return jax.vmap(Categorical(logits.shape[-1]).log_prob)(logits, edge), value
 
     decided = new.decided.reshape(-1)
     nothing = jnp.zeros(decided.shape)

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from flax import struct
 
 from hrlspec import rewards
-from hrlspec.agent import Agent, Params, TaskBook, View, in_groups, sample, shielded_action
+from hrlspec.actions import Categorical
+from hrlspec.agent import Agent, Params, TaskBook, View, in_groups, shielded_action
 from hrlspec.networks.controller import Instruction
 from hrlspec.rewards import RewardMachine
 from hrlspec.spec import RUNNING, SATISFIED, TaskState, TaskTree, advance, initial
@@ -110,7 +111,7 @@ def plan_where(
         view, task, state, noise = inputs
         tree, told = jax.tree.map(lambda x: x[task], (book.tree, book.told))
         logits, value, ahead = agent.plan_ahead(params, view, tree, state, told)
-        choice, log_prob = jax.vmap(sample)(logits, noise)
+        choice, log_prob = jax.vmap(Categorical(logits.shape[-1]).sample)(logits, noise)
         return choice, ahead[jnp.arange(choice.shape[0]), choice], log_prob, value
 
     nothing = jnp.zeros(needed.shape)
@@ -133,15 +134,15 @@ def act(
     """Chooses actions for the assigned sub-tasks.
 
     Returns:
-        Actions int32 ``[E]``, their log-probabilities, the low level's values, and bool ``[E]``: the shield
+        Actions (leading axis E), their log-probabilities, the low level's values, and bool ``[E]``: the shield
         replaced the action.
     """
 
     def one(view: View, told: Instruction, noise: jax.Array) -> Any:
-        logits, value = agent.control(params, view, told)
-        action, log_prob = sample(logits, noise)
+        outputs, value = agent.control(params, view, told)
+        action, log_prob = agent.actions.sample(outputs, noise)
         safe = shielded_action(agent, params, view, told.avoid > 0, action) if shield else action
-        return safe, log_prob, value, safe != action
+        return safe, log_prob, value, (safe != action).any()
 
     told = jax.tree.map(lambda x: x[worker.task, worker.assigned], book.told)
     return jax.vmap(one)(worker.view, dataclasses.replace(told, ahead=worker.ahead), noise)

@@ -40,12 +40,6 @@ def value_loss(value: jax.Array, target: jax.Array, mask: jax.Array, expectile: 
     return masked_mean(weight * error**2, mask)
 
 
-def entropy(logits: jax.Array) -> jax.Array:
-    """Entropy of categorical distributions ``[..., A]``, in nats."""
-    log_probs = jax.nn.log_softmax(logits)
-    return -(jnp.exp(log_probs) * jnp.where(log_probs > -1e8, log_probs, 0.0)).sum(-1)
-
-
 def optimiser(max_grad_norm: float) -> optax.GradientTransformation:
     """Adam behind a global-norm clip, without a learning rate: :func:`gradient_step` applies the annealed one."""
     return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.scale_by_adam(eps=1e-5))

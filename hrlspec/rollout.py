@@ -34,7 +34,7 @@ class Trajectory:
     decided: jax.Array  # bool, the planner decided before
     plan_log_prob: jax.Array  # float32, where decided
     plan_value: jax.Array  # float32, where decided
-    action: jax.Array  # int32
+    action: jax.Array  # int32, or float32 [..., A]
     log_prob: jax.Array  # float32
     value: jax.Array  # float32
     shielded: jax.Array  # bool, the shield replaced the action
@@ -132,7 +132,7 @@ def collect(
         keys = jax.random.split(jax.random.fold_in(key, env), 3)
         return (
             jax.random.gumbel(keys[0], (config.num_steps, num_nodes)),
-            jax.random.gumbel(keys[1], (config.num_steps, agent.num_actions)),
+            agent.actions.noise(keys[1], (config.num_steps,)),
             jax.random.split(keys[2], config.num_steps),
         )
 
@@ -197,7 +197,7 @@ def collect(
     collector = dataclasses.replace(collector, started=jnp.zeros(num_envs, jnp.int32))
     collector, trajectory = jax.lax.scan(step, collector, inputs)
     worker = collector.worker
-    low = act(agent, params, book, worker, jnp.zeros((num_envs, agent.num_actions)), shield=False)[2]
+    low = act(agent, params, book, worker, jnp.zeros((num_envs, *agent.actions.noise_shape)), shield=False)[2]
     noise = jnp.zeros((num_envs, num_nodes))
     high = plan_where(agent, params, book, worker, jnp.ones(num_envs, bool), noise)[3]
     cut = trajectory.truncated[-1]

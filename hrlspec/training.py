@@ -16,6 +16,7 @@ import optax
 from flax import struct
 
 from hrlspec import curriculum, ppo
+from hrlspec.actions import Categorical
 from hrlspec.agent import Agent, Params
 from hrlspec.batch import LowBatch, PlanBatch, build, plan_state
 from hrlspec.config import PPOConfig
@@ -24,7 +25,7 @@ from hrlspec.interaction import Decision, start
 from hrlspec.networks.planner import MASKED
 from hrlspec.rewards import RewardMachine
 from hrlspec.rollout import Collector, Trajectory, collect, fill_pool
-from hrlspec.spec import TaskState, TaskTree
+from hrlspec.spec import TaskTree
 
 Metrics = dict[str, jax.Array]
 
@@ -202,13 +203,13 @@ def controller_loss(
     row = jnp.arange(batch.slot.shape[0])[:, None]
     told = jax.tree.map(lambda x: x[row, batch.slot, batch.edge], told)
     view, told = jax.tree.map(flat, (batch.view, dataclasses.replace(told, ahead=batch.ahead)))
-    logits, value = jax.vmap(agent.control, in_axes=(None, 0, 0))(own, view, told)
-    log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), flat(batch.action)[:, None], 1)[:, 0]
+    outputs, value = jax.vmap(agent.control, in_axes=(None, 0, 0))(own, view, told)
+    log_prob = jax.vmap(agent.actions.log_prob)(outputs, flat(batch.action))
     on_policy, valid = flat(batch.on_policy), flat(batch.valid)
     advantage = ppo.normalise(flat(batch.advantage), on_policy)
     policy = ppo.policy_loss(log_prob, flat(batch.log_prob), advantage, on_policy, settings.clip)
     value_loss = ppo.value_loss(value, flat(batch.target), valid, settings.expectile)
-    randomness = ppo.masked_mean(ppo.entropy(logits), on_policy)
+    randomness = ppo.masked_mean(jax.vmap(agent.actions.entropy)(outputs), on_policy)
     loss = policy + settings.value_coefficient * value_loss - entropy_weight * randomness
     return loss, {"policy_loss": policy, "value_loss": value_loss, "entropy": randomness}
 
@@ -222,13 +223,14 @@ def planner_loss(
     logits, value = jax.vmap(apply, in_axes=(None, 0, 0, 0, 0))(
         params, batch.view, batch.tree, plan_state(batch), batch.advice
     )
-    log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), batch.edge[:, None], 1)[:, 0]
+    choices = Categorical(logits.shape[-1])
+    log_prob = jax.vmap(choices.log_prob)(logits, batch.edge)
     # Where only one edge is open there is nothing to learn, and the mean of the advantages is another one.
     free = batch.chosen & ((logits > MASKED / 2).sum(-1) > 1)
     advantage = ppo.normalise(batch.advantage, free)
     policy = ppo.policy_loss(log_prob, batch.log_prob, advantage, free, settings.clip)
     value_loss = ppo.value_loss(value, batch.target, batch.valid, settings.expectile)
-    randomness = ppo.masked_mean(ppo.entropy(logits), free)
+    randomness = ppo.masked_mean(jax.vmap(choices.entropy)(logits), free)
     loss = policy + settings.value_coefficient * value_loss - entropy_weight * randomness
     metrics = {"policy_loss": policy, "value_loss": value_loss, "entropy": randomness}
     if config.transe:
@@ -279,14 +281,13 @@ def reach_loss(
     """Squared error of Q(s, g, a) for all goals g (paper, "Avoiding Propositions")."""
     del settings, entropy_weight
     view, action, target = jax.tree.map(flat, batch)
-    values = jax.vmap(lambda v, a: agent.reach_values({"reach_critic": params}, v)[:, a])(view, action)
+    values = jax.vmap(agent.reach_values_of, in_axes=(None, 0, 0))({"reach_critic": params}, view, action)
     loss = ((values - target) ** 2).mean()
     return loss, {"value_loss": loss}
 
 
 def _advice(agent: Agent, params: Params, batch: PlanBatch) -> jax.Array:
     """The low level's advice on each decision, ``[B, N]``, at the start of the update."""
-
     told = jax.vmap(agent.instruct, in_axes=(None, 0))(params, batch.tree)
     return agent.advise(params, batch.view, batch.tree, plan_state(batch), told)[0]
 

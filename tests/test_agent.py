@@ -10,29 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hrlspec.agent import Agent, in_groups, sample, shielded_action
+from hrlspec.actions import Categorical
+from hrlspec.agent import Agent, in_groups, shielded_action
 from hrlspec.config import ShieldConfig
 from hrlspec.spec import TaskTree
 from tests.probes import Corridor, on_device, pairs, quick_jit, random_params, small_config
 from tests.tasks import random_tree
 
 P, A = 5, 4
-
-
-def test_zero_noise_gives_the_mode_and_its_log_probability() -> None:
-    logits = jnp.array([0.1, 2.0, -1.0])
-    choice, log_prob = sample(logits, jnp.zeros(3))
-    assert int(choice) == 1
-    assert float(log_prob) == pytest.approx(float(jax.nn.log_softmax(logits)[1]))
-
-
-def test_noise_samples_the_distribution() -> None:
-    logits = jnp.array([0.0, 1.0, -1e9])
-    noise = jax.random.gumbel(jax.random.key(0), (20_000, 3))
-    choice, log_prob = jax.vmap(sample, (None, 0))(logits, noise)
-    share = np.bincount(np.asarray(choice), minlength=3) / 20_000
-    np.testing.assert_allclose(share, jax.nn.softmax(logits), atol=0.015)
-    np.testing.assert_allclose(log_prob, jax.nn.log_softmax(logits)[choice])
 
 
 @pytest.mark.parametrize("group", [1, 3, 8, 50])
@@ -71,7 +56,12 @@ def test_shield_follows_its_rule(mode: str) -> None:
     replaced = 0
 
     def act(q: jax.Array, avoid: jax.Array, action: jax.Array) -> jax.Array:
-        agent = SimpleNamespace(config=SimpleNamespace(shield=ShieldConfig(mode=mode)), reach_values=lambda *_: q)
+        agent = SimpleNamespace(
+            config=SimpleNamespace(shield=ShieldConfig(mode=mode)),
+            actions=Categorical(A),
+            reach_values=lambda *_: q,
+            reach_values_of=lambda *_: q[:, action],
+        )
         return shielded_action(agent, {}, (q, q), avoid, action)
 
     compiled = quick_jit(jax.vmap(act))

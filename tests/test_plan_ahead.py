@@ -12,7 +12,7 @@ from hrlspec.agent import Agent
 from hrlspec.networks.tree import lookahead, routes
 from hrlspec.spec import TaskTree, advance, initial, open_edges
 from tests.probes import Corridor, on_device, quick_jit, random_params, small_config
-from tests.tasks import random_tree, tree_of
+from tests.tasks import random_tree
 
 ENV = Corridor()
 LENGTH = 3

@@ -11,7 +11,6 @@ import pytest
 
 from hrlspec import ppo
 from hrlspec.config import PPOConfig
-from hrlspec.networks.planner import MASKED
 
 
 def test_masked_mean_ignores_the_rest_and_survives_an_empty_mask() -> None:
@@ -61,12 +60,6 @@ def test_masked_samples_with_senseless_log_probabilities_do_no_harm() -> None:
 
     value, gradient = jax.value_and_grad(loss)(jnp.float32(0.0))
     assert (float(value), float(gradient)) == (-1, -1)
-
-
-def test_entropy_of_masked_logits() -> None:
-    logits = jnp.array([[0.3, MASKED, 0.3, 0.3], [0.0, MASKED, MASKED, MASKED]])
-    np.testing.assert_allclose(ppo.entropy(logits), [np.log(3), 0], atol=1e-6)
-    assert np.isfinite(jax.grad(lambda x: ppo.entropy(x).sum())(logits)).all()
 
 
 def test_annealing() -> None:

@@ -135,7 +135,7 @@ def _run(
         worker = dataclasses.replace(worker, awaiting=worker.awaiting & running)
         noise = noise_scale * jax.random.gumbel(plan_key, (num_episodes, num_nodes))
         worker, _ = decide(agent, params, book, worker, noise)
-        noise = noise_scale * jax.random.gumbel(act_key, (num_episodes, agent.num_actions))
+        noise = noise_scale * agent.actions.noise(act_key, (num_episodes,))
         action, *_ = act(agent, params, book, worker, noise, shield=shield)
         seen = Trace(worker.env_state, worker.task_state.node, worker.assigned, running)
         worker, result = transition(agent, machine, book, worker, action, jax.random.split(step_key, num_episodes))

@@ -35,17 +35,22 @@ class Instruction:
 
 
 class Controller(nn.Module):
-    """Encoder, embedding of the remaining task, actor and critic of the low level (discrete actions)."""
+    """Encoder, embedding of the remaining task, actor and critic of the low level.
+
+    Attributes:
+        config: sizes.
+        num_outputs: of the actor; they describe a distribution of ``hrlspec.actions``.
+    """
 
     config: NetworkConfig
-    num_actions: int
+    num_outputs: int
 
     def setup(self) -> None:
         """Declares the parts."""
         c = self.config
         self.task_embedding = TaskEmbedding(c.task_features, c.task_rounds)
         self.encoder = Encoder(c.latent, c.conv_channels, c.encoder_mlp)
-        self.actor = MLP((*c.actor, self.num_actions), final_scale=0.01)
+        self.actor = MLP((*c.actor, self.num_outputs), final_scale=0.01)
         self.critic = MLP((*c.critic, 1), tanh=True, final_scale=1.0)
 
     def instruct(self, tree: TaskTree) -> Instruction:
@@ -66,7 +71,7 @@ class Controller(nn.Module):
             told: the assigned sub-task and what follows.
 
         Returns:
-            Logits over actions ``[A]`` and the value ``[]``.
+            The actor's outputs ``[num_outputs]`` and the value ``[]``.
         """
         planes, shared = view
         if self.config.roles:
