@@ -15,6 +15,7 @@ from flax import struct
 
 from envs_jax import zone_physics
 from envs_jax.base import Box, Environment, EnvParams, StepResult
+from envs_jax.zone_contested import contested_layout
 from envs_jax.zone_layouts import COLOURS, ZONES_EACH, ZoneLayout, new_layout
 from envs_jax.zone_physics import NUM_SENSORS, Backend
 
@@ -119,6 +120,24 @@ class Zone(Environment):
         """A random layout other than ``layout`` where ``needed``, else ``layout``."""
         del params
         return new_layout(key, layout, needed)
+
+    def contested_layout(self, key: jax.Array, first: jax.Array, second: jax.Array, params: EnvParams) -> ZoneLayout:
+        """A layout on which going to the nearest zone first makes the whole way longer. The key is consumed.
+
+        Args:
+            key: of the draw.
+            first: bool ``[P]``, the colour to reach first.
+            second: bool ``[P]``, the colour to reach after it.
+            params: of the environment.
+
+        Returns:
+            A `envs_jax.zone_contested.contested_layout`; where a colour is missing, several are given or both are the
+            same, what :meth:`sample_layout` draws.
+        """
+        wanted = (first.sum() == 1) & (second.sum() == 1) & ~(first & second).any()
+        plain = self.resample_layout(key, _no_layout(), ~wanted, params)
+        contested = contested_layout(key, jnp.argmax(first), jnp.argmax(second), needed=wanted)
+        return jax.tree.map(lambda this, other: jnp.where(wanted, this, other), contested, plain)
 
     def check_layout(self, layout: ZoneLayout) -> None:
         """Raises ``ValueError`` unless everything is finite and lies inside the square.

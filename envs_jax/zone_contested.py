@@ -47,7 +47,12 @@ class _Core:
 
 
 def contested_layout(
-    key: jax.Array, first: jax.Array | int, second: jax.Array | int, mirrored: jax.Array | bool = False
+    key: jax.Array,
+    first: jax.Array | int,
+    second: jax.Array | int,
+    *,
+    mirrored: jax.Array | bool = False,
+    needed: jax.Array | bool = True,
 ) -> ZoneLayout:
     """A random contested layout, or with the same key its mirrored control. The key is consumed.
 
@@ -56,6 +61,7 @@ def contested_layout(
         first: int ``[]``, index of the colour to go to first.
         second: int ``[]``, index of the colour to go to then; another one.
         mirrored: bool ``[]``, whether the control is wanted.
+        needed: bool ``[]``; where false, no layout is drawn and what is returned means nothing.
 
     Returns:
         The layout. ``zones[first, 0]`` is the better zone of the first colour, ``zones[first, 1]`` the other, and
@@ -71,7 +77,7 @@ def contested_layout(
     heading_key, key = jax.random.split(key)
     heading = jax.random.uniform(heading_key, (), maxval=2 * jnp.pi)
     nowhere = jnp.zeros(2)
-    start = (key, _Core(nowhere, nowhere, nowhere, nowhere), jnp.zeros((5, 2)), jnp.bool_(False))
+    start = (key, _Core(nowhere, nowhere, nowhere, nowhere), jnp.zeros((5, 2)), ~jnp.bool_(needed))
     _, core, rest, _ = jax.lax.while_loop(lambda carry: ~carry[3], attempt, start)
 
     pair = jnp.stack([core.better, core.nearer])

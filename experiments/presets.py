@@ -91,6 +91,8 @@ def walk(config: Config) -> Config:
         num_envs=256,
         num_steps=128,
         planner_share=64,
+        # White noise stays within a unit of the start, and the nearest region is three away.
+        noise_correlation=0.9,
         low=dataclasses.replace(config.low, learning_rate=1e-3, minibatches=32, entropy=0.003, final_entropy=0.0),
         network=dataclasses.replace(config.network, encoder_mlp=(128, 128), planner_features=32),
     )

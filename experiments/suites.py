@@ -116,14 +116,14 @@ _ZONE_DAG = Recipe(
     lambda trees: _shortest(trees) >= 2,
 )
 _REACH_AVOID = Recipe(
-    "sequences of 2 to 6 sub-tasks in equal numbers, 1 or 2 negatives on each (tasks of one sub-task are too few to hold "
-    "any of them out)",
+    "sequences of 2 to 6 sub-tasks in equal numbers, 1 or 2 negatives on each (tasks of one sub-task are too few to "
+    "hold any of them out)",
     tuple(_sequences(level, max_avoid=2, num_drawn=40 * NUM_TASKS) for level in range(2, 7)),
     _always_avoids,
 )
 _REACH = Recipe(
-    "sequences of 4, 6, 8, 10 and 12 sub-tasks in equal numbers, without negatives (of 2 and 3 there are too few to hold "
-    "them out)",
+    "sequences of 4, 6, 8, 10 and 12 sub-tasks in equal numbers, without negatives (of 2 and 3 there are too few to "
+    "hold them out)",
     tuple(_sequences(level, max_avoid=0, num_drawn=4 * NUM_TASKS) for level in (4, 6, 8, 10, 12)),
 )
 

@@ -35,6 +35,10 @@ class Distribution(Protocol):
         """Noise for draws, float32 ``[*shape, *noise_shape]``. The key is consumed."""
         ...
 
+    def noise_sequence(self, key: jax.Array, length: int, correlation: float) -> jax.Array:
+        """Noise for successive steps, float32 ``[length, *noise_shape]``; correlated where it makes sense."""
+        ...
+
     def sample(self, outputs: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
         """An action and its log-probability ``[]`` (density, where actions are continuous)."""
         ...
@@ -71,6 +75,11 @@ class Categorical:
     def noise(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
         """See :class:`Distribution`."""
         return jax.random.gumbel(key, (*shape, self.num_actions))
+
+    def noise_sequence(self, key: jax.Array, length: int, correlation: float) -> jax.Array:
+        """See :class:`Distribution`; never correlated."""
+        del correlation
+        return self.noise(key, (length,))
 
     def sample(self, outputs: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
         """See :class:`Distribution`."""
@@ -122,6 +131,19 @@ class DiagonalGaussian:
     def noise(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
         """See :class:`Distribution`."""
         return jax.random.normal(key, (*shape, self.size))
+
+    def noise_sequence(self, key: jax.Array, length: int, correlation: float) -> jax.Array:
+        """See :class:`Distribution`: a stationary first-order autoregression, standard normal at every step."""
+        white = self.noise(key, (length,))
+        if not correlation:
+            return white
+        fresh = float(np.sqrt(1 - correlation**2))
+
+        def step(before: jax.Array, drawn: jax.Array) -> tuple[jax.Array, jax.Array]:
+            now = correlation * before + fresh * drawn
+            return now, now
+
+        return jnp.concatenate([white[:1], jax.lax.scan(step, white[0], white[1:])[1]])
 
     def sample(self, outputs: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
         """See :class:`Distribution`."""

@@ -144,6 +144,9 @@ class Config:
     """λ, the weight of the TransE loss."""
     transe_margin: float = 1.0
     """ξ, the margin of the TransE loss."""
+    noise_correlation: float = 0.0
+    """Correlation of the noise of successive steps while collecting, for continuous actions: coloured noise explores
+    farther than white noise, whose steps cancel out."""
     value_scale: float = 1.0
     """Returns are divided by this before the critics see them."""
     planner_share: int = 16

@@ -132,7 +132,7 @@ def collect(
         keys = jax.random.split(jax.random.fold_in(key, env), 3)
         return (
             jax.random.gumbel(keys[0], (config.num_steps, num_nodes)),
-            agent.actions.noise(keys[1], (config.num_steps,)),
+            agent.actions.noise_sequence(keys[1], config.num_steps, config.noise_correlation),
             jax.random.split(keys[2], config.num_steps),
         )
 
