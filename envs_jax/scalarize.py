@@ -73,7 +73,9 @@ def _run(program: Any, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
     known.update(zip(program.jaxpr.constvars, map(np.asarray, program.consts), strict=True))
 
     def read(atom: Any) -> np.ndarray:
-        return np.asarray(atom.val, atom.aval.dtype) if isinstance(atom, core.Literal) else known[atom]
+        if isinstance(atom, core.Literal):
+            return np.asarray(atom.val, getattr(atom.aval, "dtype", None))
+        return known[atom]
 
     for equation in program.jaxpr.eqns:
         results = _evaluate(equation, [read(atom) for atom in equation.invars])
