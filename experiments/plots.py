@@ -13,12 +13,10 @@ from typing import Any
 
 import jax
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
-from envs_jax import Letter
-from envs_jax.letter_render import rgb
+from experiments.stages import Leg, Stage, position_of, stage_of
 from hrlspec.agent import Agent, Params
 from hrlspec.evaluation import Suite
 from hrlspec.evaluation.cases import draw_layouts
@@ -26,9 +24,8 @@ from hrlspec.evaluation.episodes import trace_episodes
 from hrlspec.rewards import RewardMachine
 from hrlspec.spec import RUNNING, SATISFIED, VIOLATED, TaskState, TaskTree, draw_task, subtasks
 
-_CELL = 48  # pixels of a cell
-_COLORS = ("#1f5fa8", "#c2452d", "#2e8b57", "#8a4fbf", "#b8860b", "#c2408f", "#4d4d4d", "#008b8b")
 _FRAME_MS, _LAST_FRAME_MS = 350, 1500
+_MOST_FRAMES = 80
 _CURVES = {
     "eval/success_rate": "success on unseen tasks",
     "eval/spl": "SPL on unseen tasks",
@@ -60,28 +57,49 @@ def learning_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], file: Path)
 
 
 @dataclasses.dataclass(frozen=True)
-class Walk:
-    """One episode in Letter, for drawing.
+class Episode:
+    """One episode, for drawing.
 
     Attributes:
         formula: the task.
         tree: the same, unbatched.
-        layout: int ``[n, n]``.
-        cells: int ``[t + 1, 2]``, where the agent was, the end included.
+        stage: where it took place.
+        positions: ``[t + 1, 2 or more]``, where the agent was, the end included.
         nodes: int ``[t + 1]``, where the task stood.
         assigned: int ``[t]``, the edge in force at each step.
         success: the task was satisfied.
-        violated: the task was violated.
+        violated: the task was violated, or the environment ended the episode.
     """
 
     formula: str
     tree: TaskTree
-    layout: np.ndarray
-    cells: np.ndarray
+    stage: Stage
+    positions: np.ndarray
     nodes: np.ndarray
     assigned: np.ndarray
     success: bool
     violated: bool
+
+    def legs(self, names: Sequence[str]) -> list[Leg]:
+        """The sub-tasks in the order in which they were in force."""
+        changes = [0] + [
+            t
+            for t in range(1, len(self.assigned))
+            if self.nodes[t] != self.nodes[t - 1] or self.assigned[t] != self.assigned[t - 1]
+        ]
+        legs = []
+        for number, (first, end) in enumerate(zip(changes, [*changes[1:], len(self.assigned)], strict=True), 1):
+            edge = int(self.assigned[first])
+            (found,) = [x for x in subtasks(self.tree, int(self.tree.parent[edge]), names) if x.node == edge]
+            reach, avoid = (tuple(str(name) for name in some) for some in (found.reach, found.avoid))
+            label = f"{number}. {' and '.join(reach)}" + (f", avoiding {' '.join(avoid)}" if avoid else "")
+            legs.append(Leg(first, end - 1, label, reach, avoid, bool(self.nodes[end] != self.nodes[end - 1])))
+        return legs
+
+    @property
+    def outcome(self) -> str:
+        """How it ended."""
+        return "satisfied" if self.success else "violated" if self.violated else "not satisfied in time"
 
 
 def examples(
@@ -100,39 +118,42 @@ def examples(
     Returns:
         ``example_<depth>.png`` and ``task_<depth>.png`` for each depth, and ``episode.gif`` of the deepest.
     """
-    if not isinstance(agent.env, Letter):
-        return []
     has_choice = np.asarray(suite.trees.accepting).sum(-1) > 1
     length = np.array([len(formula) for formula in suite.formulas]) + 10_000 * ~has_choice
     depths = np.unique(suite.depths)
     rows = [int(np.argmin(np.where(suite.depths == depth, length, np.iinfo(int).max))) for depth in depths]
-    files = []
+    files: list[Path] = []
     names = agent.env.propositions
-    for depth, walk in zip(depths, walks(key, agent, params, machine, suite.take(rows)), strict=True):
+    shown = episodes_of(key, agent, params, machine, suite.take(rows))
+    for depth, episode in zip(depths, shown, strict=False):
         files += [folder / f"example_{depth}.png", folder / f"task_{depth}.png"]
-        trajectory(walk, names, files[-2])
-        task_graph(walk, names, files[-1])
-    return [*files, animation(walk, names, folder / "episode.gif")]
+        trajectory(episode, names, files[-2])
+        task_graph(episode, names, files[-1])
+    return [*files, animation(shown[-1], names, folder / "episode.gif")] if shown else []
 
 
-def walks(key: jax.Array, agent: Agent, params: Params, machine: RewardMachine, suite: Suite) -> list[Walk]:
-    """One episode of each task of a suite, each in a layout of its own, actions sampled."""
+def episodes_of(key: jax.Array, agent: Agent, params: Params, machine: RewardMachine, suite: Suite) -> list[Episode]:
+    """One episode of each task of a suite, each in a layout of its own, actions sampled; none without pictures."""
     layouts = draw_layouts(agent.env, suite, 1)
+    stages = [stage_of(agent.env, jax.tree.map(lambda x, i=i: x[i], layouts)) for i in range(len(suite))]
+    if None in stages:
+        return []
     episodes, trace = trace_episodes(key, agent, params, machine, suite.trees, layouts)
+    positions = position_of(trace.env_state)
     found = []
-    for i, formula in enumerate(suite.formulas):
+    for i, (formula, stage) in enumerate(zip(suite.formulas, stages, strict=True)):
         # Entry t is the state before step t, so the one after the last step is there unless the horizon came first.
-        steps = int(episodes.steps[i])
-        end = min(steps + 1, len(trace.node))
+        end = min(int(episodes.steps[i]) + 1, len(trace.node))
         tree: TaskTree = jax.tree.map(lambda x, i=i: x[i], suite.trees)
+        assert stage is not None
         found.append(
-            Walk(
+            Episode(
                 formula=formula,
                 tree=tree,
-                layout=np.asarray(layouts)[i],
-                cells=np.asarray(trace.env_state.position)[:end, i],
+                stage=stage,
+                positions=positions[:end, i],
                 nodes=np.asarray(trace.node)[:end, i],
-                assigned=np.asarray(trace.assigned)[:steps, i],
+                assigned=np.asarray(trace.assigned)[: end - 1, i],
                 success=bool(episodes.success[i]),
                 violated=bool(episodes.violated[i]),
             )
@@ -140,77 +161,44 @@ def walks(key: jax.Array, agent: Agent, params: Params, machine: RewardMachine, 
     return found
 
 
-def trajectory(walk: Walk, names: Sequence[str], file: Path) -> Path:
-    """Draws an episode as a line over the grid, coloured by the sub-task in force; chosen instances are circled."""
+def trajectory(episode: Episode, names: Sequence[str], file: Path) -> Path:
+    """Draws an episode as a line, coloured by the sub-task in force; chosen instances are marked."""
     figure = Figure(figsize=(7.5, 5.2), layout="constrained")
     ax = figure.subplots()
-    size = walk.layout.shape[0]
-    ax.imshow(rgb(walk.layout, walk.cells[0], cell_pixels=_CELL), extent=(-0.5, size - 0.5, size - 0.5, -0.5))
-    leg = 0  # counts assignments, from 1
-    for t in range(len(walk.cells) - 1):
-        label = None
-        if t == 0 or walk.nodes[t] != walk.nodes[t - 1] or walk.assigned[t] != walk.assigned[t - 1]:
-            leg += 1
-            label = f"{leg}. {_subtask(walk, int(walk.assigned[t]), names)}"
-        color = _COLORS[(leg - 1) % len(_COLORS)]
-        _draw_step(ax, walk.cells[t], walk.cells[t + 1], color, label, shift=0.06 * (leg % 5 - 2))
-        if walk.nodes[t + 1] != walk.nodes[t]:
-            row, column = walk.cells[t + 1]
-            ax.plot(column, row, "o", markersize=30, markerfacecolor="none", markeredgecolor=color, markeredgewidth=3)
-            ax.annotate(str(leg), (column + 0.3, row - 0.3), color=color, weight="bold", fontsize=11)
-    outcome = "satisfied" if walk.success else "violated" if walk.violated else "not satisfied in time"
-    title = "\n".join(textwrap.wrap(walk.formula, 80))
-    ax.set_title(f"{title}\n{outcome}, {len(walk.assigned)} steps", fontsize=9)
+    episode.stage.draw(ax, episode.positions, episode.legs(names))
+    title = "\n".join(textwrap.wrap(episode.formula, 80))
+    ax.set_title(f"{title}\n{episode.outcome}, {len(episode.assigned)} steps", fontsize=9)
     ax.set_axis_off()
     figure.legend(loc="outside right center", title="sub-tasks", fontsize=9)
     figure.savefig(file, dpi=110, metadata={"Software": None})
     return file
 
 
-def task_graph(walk: Walk, names: Sequence[str], file: Path) -> Path:
+def task_graph(episode: Episode, names: Sequence[str], file: Path) -> Path:
     """Draws the task with the branch that was taken."""
-    status = SATISFIED if walk.success else VIOLATED if walk.violated else RUNNING
-    blocked = np.zeros(walk.tree.num_nodes, bool)
-    state = TaskState(node=walk.nodes[-1], blocked=blocked, status=np.int32(status))  # type: ignore[arg-type]
-    draw_task(walk.tree, names, state).savefig(file, dpi=110, metadata={"Software": None})
+    status = SATISFIED if episode.success else VIOLATED if episode.violated else RUNNING
+    blocked = np.zeros(episode.tree.num_nodes, bool)
+    state = TaskState(node=episode.nodes[-1], blocked=blocked, status=np.int32(status))  # type: ignore[arg-type]
+    draw_task(episode.tree, names, state).savefig(file, dpi=110, metadata={"Software": None})
     return file
 
 
-def animation(walk: Walk, names: Sequence[str], file: Path) -> Path:
-    """The episode as a GIF, the sub-task in force below the grid."""
+def animation(episode: Episode, names: Sequence[str], file: Path) -> Path:
+    """The episode as a GIF, the sub-task in force below; of a long one every so many steps."""
+    legs, last = episode.legs(names), len(episode.positions) - 1
+    stride = -(-len(episode.positions) // _MOST_FRAMES)
+    times = [*range(0, last, stride), last]
     frames = []
-    for t in range(len(walk.cells)):
-        grid = rgb(walk.layout, walk.cells[t], trail=walk.cells[:t], cell_pixels=_CELL)
-        if t < len(walk.assigned):
-            caption = f"step {t}: {_subtask(walk, int(walk.assigned[t]), names)}"
-        else:
-            caption = f"step {t}: {'satisfied' if walk.success else 'violated' if walk.violated else 'out of time'}"
-        frame = Image.new("RGB", (grid.shape[1], grid.shape[0] + 28), "white")
-        frame.paste(Image.fromarray(grid), (0, 0))
-        ImageDraw.Draw(frame).text((8, grid.shape[0] + 6), caption, fill="black", font_size=15)
+    for t in times:
+        leg = next((leg for leg in legs if leg.first <= t <= leg.last), None)
+        picture = episode.stage.frame(episode.positions, t, leg)
+        caption = f"step {t}: {leg.label if leg else episode.outcome}"
+        frame = Image.new("RGB", (picture.shape[1], picture.shape[0] + 28), "white")
+        frame.paste(Image.fromarray(picture), (0, 0))
+        ImageDraw.Draw(frame).text((8, picture.shape[0] + 6), caption, fill="black", font_size=15)
         # A palette without dithering keeps the file small and the colours flat.
         frames.append(frame.quantize(64, dither=Image.Dither.NONE))
-    durations = [_FRAME_MS] * (len(frames) - 1) + [_LAST_FRAME_MS]
+    pause = _FRAME_MS if stride == 1 else _FRAME_MS // 4
+    durations = [pause] * (len(frames) - 1) + [_LAST_FRAME_MS]
     frames[0].save(file, save_all=True, append_images=frames[1:], duration=durations, loop=0)
     return file
-
-
-def _draw_step(ax: Axes, here: np.ndarray, there: np.ndarray, color: str, label: str | None, shift: float) -> None:
-    """One move; over the edge of the torus it leaves on one side and comes back on the other."""
-    move = there - here
-    style: dict[str, Any] = {"color": color, "linewidth": 2.5, "solid_capstyle": "round"}
-    if np.abs(move).max() <= 1:
-        ax.plot([here[1] + shift, there[1] + shift], [here[0] + shift, there[0] + shift], label=label, **style)
-        return
-    step = -np.sign(move) * 0.45
-    for at, to in ((here, here + step), (there - step, there)):
-        ax.plot([at[1] + shift, to[1] + shift], [at[0] + shift, to[0] + shift], label=label, **style)
-        label = None
-
-
-def _subtask(walk: Walk, edge: int, names: Sequence[str]) -> str:
-    """Such as ``a, avoiding c d``."""
-    parent = int(walk.tree.parent[edge])
-    (found,) = [each for each in subtasks(walk.tree, parent, names) if each.node == edge]
-    avoid = " ".join(str(name) for name in found.avoid)
-    return " and ".join(str(name) for name in found.reach) + (f", avoiding {avoid}" if avoid else "")
