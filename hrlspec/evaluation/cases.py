@@ -17,7 +17,8 @@ import numpy as np
 from hrlspec import solver
 from hrlspec.evaluation.suite import Suite
 from hrlspec.rewards import RewardMachine
-from hrlspec.solver import Graph, tabulate
+from hrlspec.shortest_way import has_grid, planned_steps
+from hrlspec.solver import tabulate
 from hrlspec.spec import TaskTree
 from hrlspec.yardsticks import branch_scores, myopic_steps
 
@@ -38,8 +39,8 @@ class Cases:
         suite: the tasks.
         task: int ``[B]``, rows of the suite.
         layouts: a layout pytree, numpy leaves with leading axis B.
-        optimum: float32 ``[B]``, least steps to satisfaction (committed reading), or ``None`` where the environment
-            has no exact solver.
+        optimum: float32 ``[B]``, least steps to satisfaction (committed reading): exact in finite environments, within
+            a step for each sub-task where the map is known; ``None`` elsewhere.
         myopic: float32 ``[B]``, steps of the agent that always goes to the nearest goal, inf where it fails, or
             ``None`` likewise.
         excluded: pairs of task and layout that were drawn and left out because nothing satisfies the task within
@@ -121,7 +122,7 @@ def make_cases(
     Raises:
         ValueError: if a task cannot be satisfied in (nearly) any layout.
     """
-    solve = optima and is_finite(env)
+    solve = optima and (is_finite(env) or has_grid(env))
     kept: list[list[tuple[Any, float, float]]] = [[] for _ in range(len(suite))]
     excluded = 0
     for draw in range(MOST_ROUNDS):
@@ -129,10 +130,17 @@ def make_cases(
         if not wanting:
             break
         pool = draw_layouts(env, suite, layouts_per_task, seed=seed, draw=draw)
-        graph = tabulate(env, pool) if solve else None
+        graph = tabulate(env, pool) if optima and is_finite(env) else None
         for row in wanting:
             cells = range(row * layouts_per_task, (row + 1) * layouts_per_task)
-            optimum, myopic = _solve(graph, suite, row, layouts_per_task)
+            if graph is not None:
+                part, tree = graph[cells.start : cells.stop], task_of(suite, row)
+                optimum, myopic = solver.optimal_steps(part, tree), myopic_steps(part, tree)
+            elif solve:
+                some = jax.tree.map(lambda x, cells=cells: x[cells.start : cells.stop], pool)
+                optimum, myopic = planned_steps(env, some, task_of(suite, row))
+            else:
+                optimum = myopic = np.zeros(layouts_per_task, np.float32)
             possible = optimum <= env.horizon
             excluded += int((~possible).sum())
             fresh = [
@@ -236,11 +244,3 @@ def _layouts(env: Any, key: jax.Array, hashes: jax.Array, counts: jax.Array) -> 
         return env.sample_layout(jax.random.fold_in(jax.random.fold_in(key, task), number), env.default_params)
 
     return jax.vmap(one)(hashes, counts)
-
-
-def _solve(graph: Graph | None, suite: Suite, row: int, layouts_per_task: int) -> tuple[np.ndarray, np.ndarray]:
-    """Least steps and the myopic agent's, zeros without a graph."""
-    if graph is None:
-        return np.zeros(layouts_per_task), np.zeros(layouts_per_task)
-    part, tree = graph[row * layouts_per_task : (row + 1) * layouts_per_task], task_of(suite, row)
-    return solver.optimal_steps(part, tree), myopic_steps(part, tree)

@@ -150,7 +150,8 @@ def test_native_masses() -> None:
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     full = np.zeros((3, 3))
-    mujoco.mj_fullM(model, full, data.qM)
+    for column, unit in zip(full, np.eye(3), strict=True):
+        mujoco.mj_mulM(model, data, column, unit)
     moment = zone_physics.MOMENT
     mass = zone_physics.MASS
     np.testing.assert_allclose(full, [[mass, 0, 0], [0, mass, moment], [0, moment, zone_physics.INERTIA]], atol=1e-12)
