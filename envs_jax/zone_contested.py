@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs_jax.zone_layouts import COLOURS, MOST_DRAWS, SPAWN, ZONE_KEEPOUT, ZONES_EACH, ZoneLayout
+from envs_jax.zone_layouts import COLOURS, MOST_DRAWS, NUM_ZONES, SPAWN, ZONE_KEEPOUT, ZONES_EACH, ZoneLayout
 
 ROBOT_WITHIN = 0.3
 """The robot starts this close to the middle along each axis (m)."""
@@ -34,6 +34,10 @@ _NEARER_BY = 0.1
 _GEOMETRIES = 128
 """Draws of the contest at once; a valid one is among them 99 % of the time."""
 _REACH = SPAWN - ZONE_KEEPOUT
+_REST = NUM_ZONES - 3
+"""Zones besides the contest's own."""
+_NOWHERE = 1e6
+"""Coordinates of what is not placed yet: far from everything."""
 
 
 @struct.dataclass
@@ -77,7 +81,7 @@ def contested_layout(
     heading_key, key = jax.random.split(key)
     heading = jax.random.uniform(heading_key, (), maxval=2 * jnp.pi)
     nowhere = jnp.zeros(2)
-    start = (key, _Core(nowhere, nowhere, nowhere, nowhere), jnp.zeros((5, 2)), ~jnp.bool_(needed))
+    start = (key, _Core(nowhere, nowhere, nowhere, nowhere), jnp.zeros((_REST, 2)), ~jnp.bool_(needed))
     _, core, rest, _ = jax.lax.while_loop(lambda carry: ~carry[3], attempt, start)
 
     pair = jnp.stack([core.better, core.nearer])
@@ -120,24 +124,27 @@ def _draw_core(key: jax.Array) -> tuple[_Core, jax.Array]:
 
 
 def _draw_rest(key: jax.Array, core: _Core) -> tuple[jax.Array, jax.Array]:
-    """The other zone of the second colour and those of the other two ``[5, 2]``, and whether all found a place.
+    """The other zone of the second colour and those of the other two colours ``[5, 2]``, and whether all found a place.
 
     They keep away from the first zones' reflections as well, so that a contested layout and its control share them.
     """
     near, far = _reflected(core)
-    placed = jnp.stack([core.goal, core.better, core.nearer, near, far])
-    found = jnp.bool_(True)
-    rest: list[jax.Array] = []
-    for candidates in jax.random.uniform(key, (5, MOST_DRAWS, 2), minval=-_REACH, maxval=_REACH):
+    core_zones = jnp.stack([core.goal, core.better, core.nearer, near, far])
+    draws = jax.random.uniform(key, (_REST, MOST_DRAWS, 2), minval=-_REACH, maxval=_REACH)
+
+    def place(placed: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        index, candidates = inputs
         free = (_distance(candidates[:, None], placed) >= 2 * ZONE_KEEPOUT).all(-1)
-        if not rest:
-            free &= _is_contested(core, candidates)
+        free &= (_distance(candidates[:, None], core_zones) >= 2 * ZONE_KEEPOUT).all(-1)
         for end in (core.goal, core.nearer, far):
             free &= _distance_to_way(candidates, core.robot, end) >= CLEARANCE
-        rest.append(candidates[jnp.argmax(free)])
-        placed = jnp.concatenate([placed, rest[-1][None]])
-        found &= free.any()
-    return jnp.stack(rest), found
+        free &= (index > 0) | _is_contested(core, candidates)
+        found = candidates[jnp.argmax(free)]
+        return placed.at[index].set(found), (found, free.any())
+
+    nothing = jnp.full((_REST, 2), _NOWHERE)
+    _, (rest, found) = jax.lax.scan(place, nothing, (jnp.arange(_REST), draws))
+    return rest, found.all()
 
 
 def _is_contested(core: _Core, other_goal: jax.Array) -> jax.Array:

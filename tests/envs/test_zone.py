@@ -168,14 +168,25 @@ def test_touching_blue_makes_green_vanish() -> None:
     assert labels[:, BLUE].any()
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
-def test_contested_layouts(mirrored: bool) -> None:
-    draw = jax.jit(jax.vmap(functools.partial(contested_layout, mirrored=mirrored), (0, 0, 0)))
+@functools.cache
+def contested_layouts(number: int = 256) -> tuple[np.ndarray, np.ndarray, tuple[ZoneLayout, ZoneLayout]]:
+    """First and second colours ``[number]``, the layouts and their controls."""
     rng = np.random.default_rng(0)
-    number = 256
     first = rng.integers(4, size=number)
     second = (first + rng.integers(1, 4, size=number)) % 4
-    drawn = jax.tree.map(np.asarray, draw(jax.random.split(jax.random.key(0), number), first, second))
+
+    @jax.jit
+    def draw(mirrored: bool) -> ZoneLayout:
+        one = functools.partial(contested_layout, mirrored=mirrored)
+        return jax.vmap(one)(jax.random.split(jax.random.key(0), number), jnp.asarray(first), jnp.asarray(second))
+
+    return first, second, tuple(jax.tree.map(np.asarray, draw(mirrored)) for mirrored in (False, True))
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_contested_layouts(mirrored: bool) -> None:
+    first, second, both = contested_layouts()
+    drawn, number = both[mirrored], len(first)
     robot, index = drawn.robot[:, :2], np.arange(number)
     better, other = drawn.zones[index, first, 0], drawn.zones[index, first, 1]
     goals = drawn.zones[index, second]
@@ -212,12 +223,13 @@ def test_contested_layouts(mirrored: bool) -> None:
     assert stats.kstest(drawn.robot[:, 2], stats.uniform(0, 2 * np.pi).cdf).pvalue > 1e-4
 
 
-def test_the_control_is_the_same_layout_with_the_first_colour_reflected() -> None:
-    draw = jax.jit(lambda key, mirrored: contested_layout(key, 1, 3, mirrored=mirrored))
-    plain, control = draw(jax.random.key(5), False), draw(jax.random.key(5), True)
+def test_controls_are_the_same_layouts_with_the_first_colour_reflected() -> None:
+    first, _, (plain, control) = contested_layouts()
     np.testing.assert_array_equal(plain.robot, control.robot)
-    np.testing.assert_array_equal(plain.zones[np.array([0, 2, 3])], control.zones[np.array([0, 2, 3])])
-    np.testing.assert_allclose(2 * plain.robot[:2] - plain.zones[1, ::-1], control.zones[1], atol=1e-6)
+    others = np.arange(4) != first[:, None]
+    np.testing.assert_array_equal(plain.zones[others], control.zones[others])
+    reflected = 2 * plain.robot[:, None, :2] - plain.zones[~others][:, ::-1]
+    np.testing.assert_allclose(reflected, control.zones[~others], atol=1e-6)
 
 
 def test_contested_where_two_colours_are_given() -> None:
@@ -227,8 +239,10 @@ def test_contested_where_two_colours_are_given() -> None:
     for first, second in ((eye[0], none), (none, eye[1]), (eye[2], eye[2]), (eye[0] | eye[1], eye[2])):
         drawn = draw(key, first, second, PARAMS)
         assert all(jax.tree.leaves(jax.tree.map(np.array_equal, drawn, plain)))
-    drawn, expected = draw(key, eye[2], eye[0], PARAMS), contested_layout(key, 2, 0)
-    assert all(jax.tree.leaves(jax.tree.map(np.allclose, drawn, expected)))
+    drawn = draw(key, eye[2], eye[0], PARAMS)
+    robot, pair = drawn.robot[:2], drawn.zones[2]
+    assert np.linalg.norm(pair[1] - robot) < np.linalg.norm(pair[0] - robot)
+    assert ((pair[0] - robot) * (drawn.zones[0, 0] - robot)).sum() > 0 > ((pair[1] - robot) * (pair[0] - robot)).sum()
 
 
 @pytest.mark.parametrize(

@@ -208,7 +208,7 @@ def test_lidar_is_a_plain_reading_of_its_definition() -> None:
     bodies[:6, 2] = [0, 0, 0, np.pi, 1e-9, -1e-9]
     zones[:6, :, :, 1] = bodies[:6, None, None, 1]
     with jax.enable_x64(True):
-        got = jax.vmap(lidar_readings, (0, 0, None))(jnp.asarray(bodies), jnp.asarray(zones), 0.7)
+        got = jax.jit(jax.vmap(lidar_readings, (0, 0, None)))(jnp.asarray(bodies), jnp.asarray(zones), 0.7)
     for seen, body, place in zip(got, bodies, zones, strict=True):
         np.testing.assert_allclose(seen, plain_lidar(body, place, 0.7), atol=1e-12)
     ahead = lidar_readings(jnp.zeros(3), jnp.full((4, 2, 2), jnp.array([1.0, -1e-9])), 0.5)
