@@ -1,0 +1,72 @@
+"""Gymnasium environments whose task is SPECTRL text.
+
+``env = hrlspec.gymnasium.make("letter"); env.reset(seed=0, options={"task": "achieve a; achieve b"})``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+
+import envs_jax
+from envs_jax import Environment
+from envs_jax.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
+from hrlspec.text_tasks import TextTasks
+
+
+def make(env: str | Environment, *, task: str | None = None, max_nodes: int = 64, **overrides: Any) -> GymnasiumEnv:
+    """One environment.
+
+    Args:
+        env: an environment, or a name that `envs_jax.make` knows.
+        task: the task until ``reset(options={"task": ...})`` gives another.
+        max_nodes: the largest task tree that can be given.
+        **overrides: sizes that differ from the preset's, for example ``size=9``.
+
+    Raises:
+        ValueError: if the environment or a size is unknown, or the task cannot be read.
+    """
+    world = _world(env, overrides)
+    return GymnasiumEnv(world, TextTasks(world.propositions, max_nodes), task=task)
+
+
+def make_vec(
+    env: str | Environment,
+    num_envs: int,
+    *,
+    task: str | Sequence[str] | None = None,
+    max_nodes: int = 64,
+    **overrides: Any,
+) -> GymnasiumVectorEnv:
+    """Many environments side by side; a task for all of them or one for each, see :func:`make`."""
+    world = _world(env, overrides)
+    return GymnasiumVectorEnv(world, num_envs, TextTasks(world.propositions, max_nodes), task=task)
+
+
+def register(namespace: str = "hrlspec") -> tuple[str, ...]:
+    """Makes every preset known to ``gymnasium.make`` and ``gymnasium.make_vec``; nothing is registered otherwise.
+
+    Returns:
+        The ids, such as ``hrlspec/letter-v0``.
+    """
+    ids = []
+    for name in envs_jax.registered():
+        ids.append(f"{namespace}/{name}-v0")
+        if ids[-1] not in gymnasium.registry:
+            gymnasium.register(
+                id=ids[-1],
+                entry_point="hrlspec.gymnasium:make",
+                vector_entry_point="hrlspec.gymnasium:make_vec",
+                kwargs={"env": name},
+            )
+    return tuple(ids)
+
+
+def _world(env: str | Environment, overrides: dict[str, Any]) -> Environment:
+    if isinstance(env, str):
+        return envs_jax.make(env, **overrides)
+    if overrides:
+        raise ValueError(f"found sizes ({', '.join(overrides)}) for an environment that is made already")
+    return env
