@@ -134,13 +134,13 @@ def _draw_rest(key: jax.Array, core: _Core) -> tuple[jax.Array, jax.Array]:
 
     def place(placed: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         index, candidates = inputs
-        free = (_distance(candidates[:, None], placed) >= 2 * ZONE_KEEPOUT).all(-1)
-        free &= (_distance(candidates[:, None], core_zones) >= 2 * ZONE_KEEPOUT).all(-1)
+        free = (index > 0) | _is_contested(core, candidates)
+        for zones in (placed, core_zones):
+            free &= (_distance(candidates[:, None], zones) >= 2 * ZONE_KEEPOUT).all(-1)
         for end in (core.goal, core.nearer, far):
             free &= _distance_to_way(candidates, core.robot, end) >= CLEARANCE
-        free &= (index > 0) | _is_contested(core, candidates)
         found = candidates[jnp.argmax(free)]
-        return placed.at[index].set(found), (found, free.any())
+        return jnp.where((np.arange(_REST) == index)[:, None], found, placed), (found, free.any())
 
     nothing = jnp.full((_REST, 2), _NOWHERE)
     _, (rest, found) = jax.lax.scan(place, nothing, (jnp.arange(_REST), draws))
@@ -164,11 +164,14 @@ def _reflected(core: _Core) -> tuple[jax.Array, jax.Array]:
 
 
 def _distance(left: jax.Array, right: jax.Array) -> jax.Array:
-    return jnp.sqrt(((left - right) ** 2).sum(-1))
+    # Not as a sum over the last axis: short reductions are slow on a CPU.
+    dx, dy = left[..., 0] - right[..., 0], left[..., 1] - right[..., 1]
+    return jnp.sqrt(dx * dx + dy * dy)
 
 
 def _distance_to_way(points: jax.Array, start: jax.Array, end: jax.Array) -> jax.Array:
     """Distance of points ``[..., 2]`` from a straight way."""
-    along = end - start
-    share = jnp.clip(((points - start) * along).sum(-1) / (along**2).sum(), 0.0, 1.0)
-    return _distance(points, start + share[..., None] * along)
+    along, offset = end - start, points - start
+    projected = offset[..., 0] * along[0] + offset[..., 1] * along[1]
+    share = jnp.clip(projected / (along[0] ** 2 + along[1] ** 2), 0.0, 1.0)
+    return _distance(offset, share[..., None] * along)

@@ -169,8 +169,7 @@ class DiagonalGaussian:
     def _moments(self, outputs: jax.Array) -> tuple[jax.Array, jax.Array]:
         half, middle = (self.high - self.low) / 2, (self.high + self.low) / 2
         mean, raw = outputs[: self.size], outputs[self.size :]
-        # At first a deviation of 0.6 half-widths: most of the box is tried.
-        return middle + half * mean, jnp.clip(raw - 0.5, LEAST_LOG_STD, MOST_LOG_STD) + np.log(half)
+        return middle + half * mean, jnp.clip(raw, LEAST_LOG_STD, MOST_LOG_STD) + np.log(half)
 
 
 def distribution_over(space: Discrete | Box) -> Distribution:
