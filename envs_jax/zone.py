@@ -121,7 +121,9 @@ class Zone(Environment):
         del params
         return new_layout(key, layout, needed)
 
-    def contested_layout(self, key: jax.Array, first: jax.Array, second: jax.Array, params: EnvParams) -> ZoneLayout:
+    def contested_layout(
+        self, key: jax.Array, first: jax.Array, second: jax.Array, params: EnvParams, mirrored: jax.Array | bool = False
+    ) -> ZoneLayout:
         """A layout on which going to the nearest zone first makes the whole way longer. The key is consumed.
 
         Args:
@@ -129,15 +131,22 @@ class Zone(Environment):
             first: bool ``[P]``, the colour to reach first.
             second: bool ``[P]``, the colour to reach after it.
             params: of the environment.
+            mirrored: bool ``[]``, the control instead, where the nearest zone is the right one.
 
         Returns:
-            A `envs_jax.zone_contested.contested_layout`; where a colour is missing, several are given or both are the
+            A `envs_jax.zone_contested.contested_layout`, whose right zone of the first colour is number 0; where a colour is missing, several are given or both are the
             same, what :meth:`sample_layout` draws.
         """
         wanted = (first.sum() == 1) & (second.sum() == 1) & ~(first & second).any()
         plain = self.resample_layout(key, _no_layout(), ~wanted, params)
-        contested = contested_layout(key, jnp.argmax(first), jnp.argmax(second), needed=wanted)
+        contested = contested_layout(key, jnp.argmax(first), jnp.argmax(second), mirrored=mirrored, needed=wanted)
         return jax.tree.map(lambda this, other: jnp.where(wanted, this, other), contested, plain)
+
+    def instance_at(self, state: ZoneState, goal: jax.Array) -> jax.Array:
+        """Which zone of a colour (``goal``, one-hot bool ``[P]``) the robot is nearest to, int32 ``[]``."""
+        zones = state.layout.zones[jnp.argmax(goal)]
+        dx, dy = zones[:, 0] - state.body[0], zones[:, 1] - state.body[1]
+        return jnp.argmin(dx * dx + dy * dy).astype(jnp.int32)
 
     def check_layout(self, layout: ZoneLayout) -> None:
         """Raises ``ValueError`` unless everything is finite and lies inside the square.

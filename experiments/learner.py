@@ -18,6 +18,7 @@ from experiments.options import Experiment, environment_of
 from experiments.presets import rewards_of
 from experiments.suites import load_suite, reserved_hashes, suite_names
 from hrlspec.agent import Agent, Params
+from hrlspec.contested import can_contest
 from hrlspec.curriculum import draw_bank
 from hrlspec.evaluation import (
     ChoiceResult,
@@ -27,7 +28,6 @@ from hrlspec.evaluation import (
     SuiteResult,
     choice_evaluation,
     final_evaluation,
-    is_finite,
     periodic_evaluation,
     return_evaluation,
 )
@@ -105,7 +105,7 @@ class Learner:
         suite = self.test_suite.take(_spread(len(self.test_suite), settings.final_tasks))
         result = final_evaluation(self.env, suite, episodes=len(suite), greedy=settings.greedy)(keys[0], *how)
         choice = returns = None
-        if settings.contested and is_finite(self.env):
+        if settings.contested and can_contest(self.env):
             evaluation = choice_evaluation(self.env, num_cases=settings.contested, greedy=settings.greedy)
             choice = evaluation(keys[1], *how)
         if self.experiment.reward_set == 2 and "branches" in suite_names(self.experiment.env):

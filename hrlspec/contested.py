@@ -60,9 +60,9 @@ class ContestedSuite(NamedTuple):
         layouts: a layout pytree with leading axis Q.
         tasks: a :class:`TaskTree` with leading axis Q.
         contested: bool ``[Q]``, false for controls.
-        right: bool ``[Q, S]``.
+        right: bool ``[Q, S]``; S are instances of the first goal where the environment is not finite.
         nearest: int ``[Q]``.
-        optimum: float32 ``[Q]``, least steps to satisfaction.
+        optimum: float32 ``[Q]``, least steps to satisfaction, nan where they are not known.
     """
 
     layouts: Any
@@ -71,6 +71,11 @@ class ContestedSuite(NamedTuple):
     right: np.ndarray
     nearest: np.ndarray
     optimum: np.ndarray
+
+
+def can_contest(env: Any) -> bool:
+    """Whether an environment has contested layouts to evaluate on."""
+    return hasattr(env, "transition_table") or hasattr(env, "instance_at")
 
 
 def two_step_task(first: int, second: int, num_propositions: int, num_nodes: int = 3) -> TaskTree:
@@ -169,7 +174,8 @@ def contested_suite(
     is kept for the reason above alone, so the suite is a random sample of such layouts.
 
     Args:
-        env: an environment with ``sample_layout`` and ``transition_table``.
+        env: an environment with ``transition_table``, or with ``instance_at`` and layouts that are contested by the way
+            they are drawn.
         key: consumed.
         num_cases: Q, an even number.
         margin: see :func:`find_contested`.
@@ -183,6 +189,8 @@ def contested_suite(
     if num_cases < 2 or num_cases % 2:
         raise ValueError(f"num_cases is {num_cases}, expected a positive even number: half of them are controls")
     params = env.default_params if params is None else params
+    if not hasattr(env, "transition_table"):
+        return _drawn_suite(env, key, num_cases, max_nodes, params)
     wanted = num_cases // 2
     kept: dict[bool, list[tuple[Any, ...]]] = {True: [], False: []}
     pairs = _pairs(env.num_propositions)
@@ -204,6 +212,31 @@ def contested_suite(
             return ContestedSuite(layouts, tasks, *(np.stack([case[i] for case in cases]) for i in range(2, 6)))
     found_so_far = f"{len(kept[True])} contested and {len(kept[False])} control cases"
     raise ValueError(f"{env.name}: only {found_so_far} in {512 * most_rounds} layouts, {wanted} of each are wanted")
+
+
+def _drawn_suite(env: Any, key: jax.Array, num_cases: int, max_nodes: int, params: Any) -> ContestedSuite:
+    """Contested layouts and, with the same keys, their mirrored controls; instance 0 is the right one on both."""
+    wanted = num_cases // 2
+    pairs = _pairs(env.num_propositions)
+    trees = [two_step_task(*next(pairs), env.num_propositions, max_nodes) for _ in range(wanted)]
+    tasks: TaskTree = jax.tree.map(lambda *leaves: np.stack(leaves * 2), *trees)
+    contested = np.arange(num_cases) < wanted
+    keys = jax.random.split(key, wanted)[np.arange(num_cases) % wanted]
+    layouts = _contested_layouts(env, keys, tasks.reach[:, 1], tasks.reach[:, 2], params, ~contested)
+    return ContestedSuite(
+        layouts=jax.tree.map(np.asarray, layouts),
+        tasks=tasks,
+        contested=contested,
+        right=np.tile(np.array([True, False]), (num_cases, 1)),
+        nearest=contested.astype(np.int64),
+        optimum=np.full(num_cases, np.nan, np.float32),
+    )
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _contested_layouts(env: Any, keys: Any, first: Any, second: Any, params: Any, mirrored: Any) -> Any:
+    """One layout for each key."""
+    return jax.vmap(env.contested_layout, (0, 0, 0, None, 0))(keys, first, second, params, mirrored)
 
 
 @functools.partial(jax.jit, static_argnums=0)

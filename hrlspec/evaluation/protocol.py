@@ -102,8 +102,12 @@ class ChoiceEvaluation:
         episodes, trace = trace_episodes(key, agent, params, machine, suite.tasks, suite.layouts, greedy=self.greedy)
         # Entry t of a trace is the state before step t, so the first one away from the root is where the edge led.
         away = trace.running & (trace.node != TaskTree.ROOT)
-        states = np.asarray(jax.vmap(jax.vmap(agent.env.graph_state))(trace.env_state))  # type: ignore[attr-defined]
-        place = np.take_along_axis(states, away.argmax(0)[None], 0)[0]
+        there = jax.tree.map(lambda x: x[away.argmax(0), np.arange(x.shape[1])], trace.env_state)
+        env: Any = agent.env
+        if hasattr(env, "graph_state"):
+            place = np.asarray(jax.vmap(env.graph_state)(there))
+        else:
+            place = np.asarray(jax.vmap(env.instance_at)(there, suite.tasks.reach[:, 1]))
         return score_choices(suite, episodes.success, np.where(away.any(0), place, -1), greedy=self.greedy)
 
 
@@ -197,7 +201,7 @@ def return_evaluation(
 
 
 def choice_evaluation(env: Any, *, num_cases: int = 400, seed: int = 1, greedy: bool = False) -> ChoiceEvaluation:
-    """Contested choice on ``num_cases`` layouts, half of them controls; for finite environments."""
+    """Contested choice on ``num_cases`` layouts, half of them controls; for environments that ``can_contest``."""
     return ChoiceEvaluation(contested_suite(env, jax.random.key(seed), num_cases=num_cases), greedy)
 
 
