@@ -134,8 +134,8 @@ class Zone(Environment):
             mirrored: bool ``[]``, the control instead, where the nearest zone is the right one.
 
         Returns:
-            A `envs_jax.zone_contested.contested_layout`, whose right zone of the first colour is number 0; where a colour is missing, several are given or both are the
-            same, what :meth:`sample_layout` draws.
+            A `envs_jax.zone_contested.contested_layout`, whose right zone of the first colour is number 0; where a
+            colour is missing, several are given or both are the same, what :meth:`sample_layout` draws.
         """
         wanted = (first.sum() == 1) & (second.sum() == 1) & ~(first & second).any()
         plain = self.resample_layout(key, _no_layout(), ~wanted, params)
