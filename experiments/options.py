@@ -187,7 +187,7 @@ def check_config(config: Config) -> None:
         UserError: naming the first flag at fault, what was found and what was expected.
     """
     curriculum, relabel, shield, network = config.curriculum, config.relabel, config.shield, config.network
-    for name in ("num_envs", "num_steps", "total_steps", "planner_share", "group"):
+    for name in ("num_envs", "num_steps", "total_steps", "steps_per_slot", "planner_share", "group"):
         _at_least(1, name, getattr(config, name))
     _at_least(2, "num_steps", config.num_steps)
     for name in ("levels", "tasks_per_level", "max_branching"):
@@ -200,6 +200,7 @@ def check_config(config: Config) -> None:
         ("curriculum.promotion", curriculum.promotion),
         ("curriculum.earlier", curriculum.earlier),
         ("curriculum.tree_share", curriculum.tree_share),
+        ("curriculum.contested", curriculum.contested),
         ("relabel.share", relabel.share),
         ("relabel.branch", relabel.branch),
         ("shield.threshold", shield.threshold),
@@ -212,11 +213,15 @@ def check_config(config: Config) -> None:
         ("shield.learning_rate", shield.learning_rate),
     ):
         _between(0, 1e6, name, value)
+    _between(0, 0.999, "noise_correlation", config.noise_correlation)
     _between(1e-6, 1e6, "value_scale", config.value_scale)
+    _between(0, 1e6, "network.advice", network.advice)
     for field in dataclasses.fields(network):
         sizes = getattr(network, field.name)
         least = 1 if field.name in ("latent", "planner_features", "planner_hidden", "task_features") else 0
         for size in sizes if isinstance(sizes, tuple) else (sizes,):
+            if isinstance(size, float):
+                continue
             _at_least(1 if isinstance(sizes, tuple) else least, f"network.{field.name}", size)
     _check_level("low", config.low)
     _check_level("high", config.high)
@@ -227,6 +232,7 @@ def _check_level(level: str, settings: PPOConfig) -> None:
     for name in ("epochs", "minibatches"):
         _at_least(1, f"{level}.{name}", getattr(settings, name))
     _between(0, 1, f"{level}.gae_lambda", settings.gae_lambda)
+    _between(0, 1, f"{level}.expectile", settings.expectile)
     for name in ("learning_rate", "final_learning_rate", "clip", "entropy", "final_entropy", "value_coefficient"):
         _between(0, 1e6, f"{level}.{name}", getattr(settings, name))
     _between(1e-9, 1e9, f"{level}.max_grad_norm", settings.max_grad_norm)

@@ -86,11 +86,12 @@ def walk(config: Config) -> Config:
         total_steps=2_000_000,
         discount=0.99,
         num_steps=128,
+        steps_per_slot=16,
         planner_share=64,
         # White noise stays within a unit of the start, and the nearest region is three away.
         noise_correlation=0.98,
         low=dataclasses.replace(config.low, learning_rate=1e-3, epochs=3, entropy=0.003, final_entropy=0.0),
-        network=dataclasses.replace(config.network, encoder_mlp=(128, 128), planner_features=32),
+        network=dataclasses.replace(config.network, encoder_mlp=(128, 128), planner_features=32, critic=(64, 64)),
         # At first some regions are found rarely; waiting for the last of them would waste the others.
         curriculum=dataclasses.replace(config.curriculum, promotion=0.85, window=256),
     )
@@ -102,12 +103,13 @@ def zone(config: Config) -> Config:
         config,
         total_steps=10_000_000,
         discount=0.998,
-        num_envs=256,
         num_steps=128,
+        steps_per_slot=16,
         planner_share=64,
-        low=dataclasses.replace(config.low, learning_rate=7e-4, minibatches=32, entropy=0.003, final_entropy=0.0),
-        network=dataclasses.replace(config.network, latent=128, encoder_mlp=(128, 128)),
-        curriculum=dataclasses.replace(config.curriculum, levels=3, max_avoid=2),
+        noise_correlation=0.95,
+        low=dataclasses.replace(config.low, learning_rate=7e-4, epochs=3, entropy=0.003, final_entropy=0.0),
+        network=dataclasses.replace(config.network, latent=128, encoder_mlp=(128, 128), critic=(64, 64)),
+        curriculum=dataclasses.replace(config.curriculum, levels=3, max_avoid=2, promotion=0.85, window=256),
     )
 
 

@@ -149,6 +149,8 @@ class Config:
     farther than white noise, whose steps cancel out."""
     value_scale: float = 1.0
     """Returns are divided by this before the critics see them."""
+    steps_per_slot: int = 5
+    """A rollout tells T divided by this many episodes of an environment apart, two at least."""
     planner_share: int = 16
     """The planner trains on at most E·T divided by this many decisions per iteration."""
     group: int = 32
@@ -168,7 +170,7 @@ class Config:
     @property
     def episode_slots(self) -> int:
         """Episodes of one environment that a rollout tells apart; what comes after them is left out of the update."""
-        return max(2, self.num_steps // 5)
+        return max(2, self.num_steps // self.steps_per_slot)
 
     @property
     def num_iterations(self) -> int:
