@@ -61,7 +61,7 @@ def stage_of(env: Environment, layout: Any) -> Stage | None:
         zones = np.asarray(layout.zones)
         radius = float(env.radius)  # type: ignore[attr-defined]
         regions = [
-            Region(name, *map(float, centre), radius)
+            Region(name, float(centre[0]), float(centre[1]), radius)
             for name, some in zip(env.propositions, zones, strict=True)
             for centre in some
         ]
