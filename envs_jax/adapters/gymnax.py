@@ -1,0 +1,126 @@
+"""Environments with gymnax's five-tuple interface, for code that was written against it. Needs nothing installed."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from envs_jax.adapters.tasks import Episode, Step, Task, Tasks, begin, begin_where, reading, step
+from envs_jax.base import Box, Discrete, Environment, EnvParams, Info
+
+FiveTuple = tuple[jax.Array, Episode, jax.Array, jax.Array, Info]
+
+
+@struct.dataclass
+class GymnaxParams:
+    """What may be traced: ``vmap`` over it for a batch of tasks.
+
+    Attributes:
+        env: the environment's parameters.
+        task: the task, as :meth:`GymnaxEnv.params_for` reads it.
+    """
+
+    env: EnvParams
+    task: Task
+
+
+@dataclasses.dataclass(frozen=True)
+class GymnaxEnv:
+    """An environment, with a task that lives in the parameters.
+
+    ``done`` is true when the task has ended, done or lost, when the environment ended the episode, and at the
+    horizon; ``info["discount"]`` is 0 where there is nothing to bootstrap from, so 1 at the horizon.
+
+    Attributes:
+        env: the environment.
+        tasks: the language of its tasks; without one, no task can be given.
+        task: the task of ``default_params``; without one, the bare environment.
+    """
+
+    env: Environment
+    tasks: Tasks | None = None
+    task: str | None = None
+
+    def __post_init__(self) -> None:
+        reading(self.tasks, self.task)  # A task that cannot be read is refused here.
+
+    @property
+    def name(self) -> str:
+        """The preset's name."""
+        return self.env.name
+
+    @property
+    def default_params(self) -> GymnaxParams:
+        """The parameters with the task of this environment."""
+        return GymnaxParams(env=self.env.default_params, task=reading(self.tasks, self.task)[1])
+
+    @property
+    def num_actions(self) -> int:
+        """Discrete actions, or numbers in a continuous one."""
+        space = self.env.action_space
+        return space.n if isinstance(space, Discrete) else math.prod(space.shape)
+
+    def params_for(self, text: str) -> GymnaxParams:
+        """The parameters with another task; their shapes are the same for every text.
+
+        Raises:
+            ValueError: if the text means no task, or this environment was made without a task.
+        """
+        if self.task is None:
+            raise ValueError(f"found the task {text!r} for an environment made without one; give it `task` first")
+        return GymnaxParams(env=self.env.default_params, task=reading(self.tasks, text)[1])
+
+    def action_space(self, params: GymnaxParams | None = None) -> Box | Discrete:
+        """Where actions lie."""
+        return self.env.action_space
+
+    def observation_space(self, params: GymnaxParams | None = None) -> Box:
+        """Where observations lie."""
+        return self.env.observation_space
+
+    def reset(self, key: jax.Array, params: GymnaxParams | None = None) -> tuple[jax.Array, Episode]:
+        """Starts an episode in a new layout: ``(observation, state)``. The key is consumed."""
+        params = self.default_params if params is None else params
+        return begin(self.env, self._language, key, params.task, params.env)
+
+    def step(self, key: jax.Array, state: Episode, action: jax.Array, params: GymnaxParams | None = None) -> FiveTuple:
+        """One step with auto-reset: ``(observation, state, reward, done, info)``. The key is consumed.
+
+        Where the episode ended, observation and state are the next one's first, in a new layout;
+        ``info["final_observation"]`` is what the step led to, and everything else in ``info`` belongs to it.
+        """
+        params = self.default_params if params is None else params
+        step_key, restart_key = jax.random.split(key)
+        observation, state, reward, done, info = self.step_env(step_key, state, action, params)
+        info["final_observation"] = observation
+        observation, state = begin_where(
+            self.env, self._language, done, restart_key, observation, state, params.task, params.env
+        )
+        return observation, state, reward, done, info
+
+    def step_env(
+        self, key: jax.Array, state: Episode, action: jax.Array, params: GymnaxParams | None = None
+    ) -> FiveTuple:
+        """One step without auto-reset."""
+        params = self.default_params if params is None else params
+        state, now = step(self.env, self._language, key, state, params.task, action, params.env)
+        return now.observation, state, now.reward, now.terminated | now.truncated, _info(now)
+
+    @property
+    def _language(self) -> Any:
+        return reading(self.tasks, self.task)[0]
+
+
+def _info(now: Step) -> Info:
+    return {
+        "discount": 1.0 - now.terminated.astype(jnp.float32),
+        "terminated": now.terminated,
+        "truncated": now.truncated,
+        "success": now.success,
+        "labels": now.labels,
+    }
