@@ -118,7 +118,7 @@ def test_wrong_calls_are_refused() -> None:
             env.reset(options=options)
     env.reset()
     for action in (2, -1, 0.5, [0]):
-        with pytest.raises(ValueError, match=r"found an? action"):
+        with pytest.raises(ValueError, match=r"found .*action"):
             env.step(action)
     with pytest.raises(ValueError, match=r"without a task language.*hrlspec\.gymnasium\.make"):
         GymnasiumEnv(CORRIDOR, task="achieve a")

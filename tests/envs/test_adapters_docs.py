@@ -1,0 +1,63 @@
+"""docs/new_environment.md: its code runs, and the environment in it keeps the contract."""
+
+from __future__ import annotations
+
+import functools
+import re
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from envs_jax import Environment
+from tests.envs import test_contract as contract
+
+PAGE = Path(__file__).parents[2] / "docs" / "new_environment.md"
+BLOCKS = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+
+
+@functools.cache
+def world() -> dict[str, Any]:
+    names: dict[str, Any] = {"__name__": "new_environment"}
+    exec(compile(BLOCKS[0], str(PAGE), "exec", dont_inherit=True), names)
+    return names
+
+
+def ring() -> Environment:
+    env: Environment = world()["Ring"]()
+    return env
+
+
+def test_forty_lines_are_enough() -> None:
+    lines = BLOCKS[0][BLOCKS[0].index("class Ring(") :].splitlines()
+    assert len([line for line in lines if line]) <= 40
+
+
+@pytest.mark.parametrize(
+    "check",
+    [
+        contract.test_shapes_dtypes_and_spaces,
+        contract.test_truncation_is_not_termination,
+        contract.test_auto_reset_keeps_the_final_observation_and_never_repeats_a_layout,
+        contract.test_a_resampled_layout_differs_only_where_needed,
+    ],
+)
+def test_it_keeps_the_contract(check: Any) -> None:
+    check(ring())
+
+
+def test_its_layouts_are_checked() -> None:
+    ring().check_layout(np.array([1, 2, 3]))
+    with pytest.raises(ValueError, match=r"cells \[1, 1, 2\]"):
+        ring().check_layout(np.array([1, 1, 2]))
+
+
+def test_the_rest_of_the_page_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    names = dict(world())
+    for block in BLOCKS[1:]:
+        exec(compile(block, str(PAGE), "exec", dont_inherit=True), names)
+    assert capsys.readouterr().out.startswith("('achieve red',)\n")
+    assert int(names["state"].iteration) == 1
+    assert all(np.isfinite(value).all() for value in jax.tree.leaves(names["metrics"]))
