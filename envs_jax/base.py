@@ -9,6 +9,7 @@ Axes: **P** atomic propositions, **S** states of a finite environment, **A** its
 from __future__ import annotations
 
 import abc
+import dataclasses
 from typing import Any, ClassVar
 
 import jax
@@ -84,6 +85,22 @@ class Box:
         return value.shape == self.shape and bool(np.all((value >= self.low) & (value <= self.high)))
 
 
+@dataclasses.dataclass(frozen=True)
+class Symmetries:
+    """Ways to turn a world of images so that it stays the same world.
+
+    Seen through turn k, ``plane.reshape(-1)[cells[k]]`` shows what ``plane`` shows now, and action ``actions[k][a]``
+    does what action ``a`` does now. Hashable, so that it can be a static attribute of a network.
+
+    Attributes:
+        cells: a permutation of the image's S cells for each of K turns.
+        actions: a permutation of the A actions for each.
+    """
+
+    cells: tuple[tuple[int, ...], ...]
+    actions: tuple[tuple[int, ...], ...]
+
+
 class Environment(abc.ABC):
     """A world with labels. Rewards come from tasks, so environments pay 0 and end episodes by truncation only.
 
@@ -116,6 +133,11 @@ class Environment(abc.ABC):
     @abc.abstractmethod
     def action_space(self) -> Discrete | Box:
         """Where actions lie."""
+
+    @property
+    def symmetries(self) -> Symmetries | None:
+        """How images can be turned without changing the world; ``None`` where there is nothing to say."""
+        return None
 
     @property
     def num_propositions(self) -> int:

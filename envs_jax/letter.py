@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs_jax.base import Box, Discrete, Environment, EnvParams, StepResult
+from envs_jax.base import Box, Discrete, Environment, EnvParams, StepResult, Symmetries
 from envs_jax.letter_contested import most_contested, myopia_regret
 
 NO_LETTER = -1
@@ -119,6 +119,20 @@ class Letter(Environment):
     def action_space(self) -> Discrete:
         """Up, down, left, right."""
         return Discrete(n=self.num_actions)
+
+    @functools.cached_property
+    def symmetries(self) -> Symmetries | None:
+        """The eight turns and reflections of a grid whose middle cell is the agent's; of odd sizes only."""
+        if self.size % 2 == 0:
+            return None
+        index = np.arange(self.size**2).reshape(self.size, self.size)
+        turns = [(axes, rows, columns) for axes in ((0, 1), (1, 0)) for rows in (1, -1) for columns in (1, -1)]
+        cells, actions = [], []
+        for axes, rows, columns in turns:
+            cells.append(tuple(int(cell) for cell in index.transpose(axes)[::rows, ::columns].reshape(-1)))
+            turned = MOVES[:, list(axes)] * np.array([rows, columns])
+            actions.append(tuple(int(np.flatnonzero((move == MOVES).all(1))[0]) for move in turned))
+        return Symmetries(cells=tuple(cells), actions=tuple(actions))
 
     def sample_layout(self, key: jax.Array, params: EnvParams) -> jax.Array:
         """A random layout, int8 ``[n, n]``: uniform over those in which every letter can be reached."""

@@ -67,7 +67,7 @@ class Agent:
     @functools.cached_property
     def controller(self) -> Controller:
         """The low level."""
-        return Controller(self.config.network, self.actions.num_outputs)
+        return Controller(self.config.network, self.actions.num_outputs, self.env.symmetries)
 
     @functools.cached_property
     def reach_critic(self) -> ReachCritic:

@@ -52,6 +52,25 @@ def test_gaussian_density_is_scipys() -> None:
         assert float(actions.entropy(jnp.asarray(outputs))) == pytest.approx(entropy, rel=1e-4)
 
 
+@pytest.mark.parametrize("correlation", [0.0, 0.9])
+def test_coloured_noise_is_standard_normal_at_every_step_and_correlated_in_time(correlation: float) -> None:
+    actions = DiagonalGaussian(size=2, low=-1.0, high=1.0)
+    keys = jax.random.split(jax.random.key(0), 4000)
+    noise = np.asarray(jax.vmap(lambda key: actions.noise_sequence(key, 20, correlation))(keys))
+    assert noise.shape == (4000, 20, 2)
+    np.testing.assert_allclose(noise.mean(0), 0, atol=0.08)
+    np.testing.assert_allclose(noise.std(0), 1, atol=0.06)
+    for lag in (1, 5):
+        found = (noise[:, lag:] * noise[:, :-lag]).mean((0, 1))
+        np.testing.assert_allclose(found, correlation**lag, atol=0.03)
+    assert abs((noise[..., 0] * noise[..., 1]).mean()) < 0.03
+
+
+def test_discrete_noise_is_never_correlated() -> None:
+    actions, key = Categorical(3), jax.random.key(0)
+    np.testing.assert_array_equal(actions.noise_sequence(key, 5, 0.9), actions.noise(key, (5,)))
+
+
 @pytest.mark.parametrize("space", SPACES)
 def test_candidates_lie_in_the_space_and_reach_its_corners(space: Discrete | Box) -> None:
     actions: Distribution = distribution_over(space)

@@ -9,8 +9,10 @@ from __future__ import annotations
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
+from envs_jax import Symmetries
 from hrlspec.config import NetworkConfig
 from hrlspec.networks.encoder import MLP, Encoder
 from hrlspec.networks.tree import TaskEmbedding, lookahead
@@ -34,16 +36,46 @@ class Instruction:
     future: jax.Array
 
 
+def turn(planes: jax.Array, symmetries: Symmetries) -> tuple[jax.Array, jax.Array]:
+    """Turns images by role so that the nearest goal, and then what comes after it, lies in one sector.
+
+    Args:
+        planes: float32 ``[R, H, W]``, the agent in the middle: the goal, what to avoid, then what lies ahead.
+        symmetries: K ways to turn them.
+
+    Returns:
+        The images, and for each action its place among the turned ones, int32 ``[A]``.
+    """
+    cells = np.array(symmetries.cells)
+    flat = planes.reshape(planes.shape[0], -1)
+    # What is seen of each goal, as one number for every turn; the sector is where that of the nearest is largest.
+    seen = (flat @ sector_weights(planes.shape[1], planes.shape[2])[cells].T).T
+    score = seen[:, 0] + (0.05 * seen[:, 2:].sum(-1) if planes.shape[0] > 2 else 0.0)
+    best = jnp.argmax(score)
+    turned = flat[:, jnp.asarray(cells)[best]].reshape(planes.shape)
+    return turned, jnp.asarray(symmetries.actions, jnp.int32)[best]
+
+
+def sector_weights(height: int, width: int) -> np.ndarray:
+    """Weights ``[H·W]`` that fall with the distance from the middle, and for equal distance prefer a sector."""
+    rows, columns = np.divmod(np.arange(height * width), width)
+    down, right = rows - height // 2, columns - width // 2
+    # Near cells outweigh far ones, so the nearest goal decides; where it lies on an axis, what is farther breaks the tie.
+    return ((2 + down / height + right / (3 * width)) * 3.0 ** -(np.abs(down) + np.abs(right))).astype(np.float32)
+
+
 class Controller(nn.Module):
     """Encoder, embedding of the remaining task, actor and critic of the low level.
 
     Attributes:
         config: sizes.
         num_outputs: of the actor; they describe a distribution of ``hrlspec.actions``.
+        symmetries: how the world can be turned, if at all.
     """
 
     config: NetworkConfig
     num_outputs: int
+    symmetries: Symmetries | None = None
 
     def setup(self) -> None:
         """Declares the parts."""
@@ -77,11 +109,15 @@ class Controller(nn.Module):
         if self.config.roles:
             # By role the encoder need not push the whole observation through its latent to find the goal afterwards.
             planes = jnp.tensordot(jnp.concatenate([told.reach[None], told.avoid[None], told.ahead]), planes, axes=1)
+        turned = None
+        if self.config.roles and self.config.symmetric and self.symmetries:
+            planes, turned = turn(planes, self.symmetries)
         latent = nn.relu(self.encoder(planes, shared))
         # With the planner's advice there is a plan, and what remains is the rest of the plan.
         future = self.task_embedding.of_way(told.ahead) if self.config.advice else told.future
         x = jnp.concatenate([latent, told.reach, told.avoid, future])
-        return self.actor(x), self.critic(x)[0]
+        outputs = self.actor(x)
+        return outputs if turned is None else outputs[turned], self.critic(x)[0]
 
     def everything(self, view: tuple[jax.Array, jax.Array], tree: TaskTree) -> tuple[jax.Array, jax.Array]:
         """Touches every parameter, for initialisation."""
