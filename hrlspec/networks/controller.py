@@ -48,8 +48,9 @@ def turn(planes: jax.Array, symmetries: Symmetries) -> tuple[jax.Array, jax.Arra
     """
     cells = np.array(symmetries.cells)
     flat = planes.reshape(planes.shape[0], -1)
-    # What is seen of each goal, as one number for every turn; the sector is where that of the nearest is largest.
-    seen = (flat @ sector_weights(planes.shape[1], planes.shape[2])[cells].T).T
+    # What is seen of each goal, one number for every turn, which is largest where the nearest lies in the sector. Turning
+    # the images back turns the weights forth, hence their inverse permutation.
+    seen = (flat @ sector_weights(planes.shape[1], planes.shape[2])[np.argsort(cells)].T).T
     score = seen[:, 0] + (0.05 * seen[:, 2:].sum(-1) if planes.shape[0] > 2 else 0.0)
     best = jnp.argmax(score)
     turned = flat[:, jnp.asarray(cells)[best]].reshape(planes.shape)
