@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import envs_jax
 from hrlspec.agent import Agent
 from hrlspec.networks.controller import Instruction
 from hrlspec.networks.encoder import patches
@@ -245,3 +246,27 @@ def test_the_reach_critic_answers_in_the_unit_interval_for_each_goal() -> None:
     values = np.asarray(agent.reach_values(params, VIEW))
     assert values.shape == (4, 2)
     assert ((values > 0) & (values < 1)).all()
+
+
+def test_the_low_level_turns_with_the_world() -> None:
+    """Seen through any of the eight turns, it acts as before, turned, and values what it sees alike."""
+    env = envs_jax.make("letter")
+    network = dataclasses.replace(small_config().network, lookahead=3, symmetric=True)
+    agent, turns = Agent(env, small_config(network=network)), env.symmetries
+    assert turns is not None
+    params = random_params(agent, 3)
+    letters = np.eye(env.num_propositions, dtype=np.float32)
+    told = Instruction(reach=letters[0], avoid=letters[1], ahead=letters[2:], future=np.zeros(network.task_features))
+    control = quick_jit(lambda view: agent.control(params, view, told))
+    straight = 0
+    for seed in range(10):
+        observation, _ = env.reset(jax.random.key(seed), env.default_params)
+        planes, shared = env.proposition_view(observation)
+        outputs, value = control((planes, shared))
+        for cells, actions in zip(turns.cells, turns.actions, strict=True):
+            turned = planes.reshape(len(planes), -1)[:, np.array(cells)].reshape(planes.shape)
+            again, same = control((turned, shared))
+            np.testing.assert_allclose(np.asarray(again)[np.array(actions)], outputs, rtol=1e-4, atol=1e-4)
+            np.testing.assert_allclose(same, value, rtol=1e-4, atol=1e-4)
+        straight += len(np.unique(np.round(np.asarray(outputs), 3)))
+    assert straight > 20  # the outputs do tell the actions apart

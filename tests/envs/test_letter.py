@@ -12,6 +12,7 @@ from scipy import stats
 
 import envs_jax
 from envs_jax import letter_render
+from tests.probes import quick_jit
 
 
 def _layouts(env: envs_jax.Letter, number: int, seed: int = 0) -> np.ndarray:
@@ -216,3 +217,29 @@ def test_drawing_refuses_nonsense(draw) -> None:
 def test_cells_too_small_to_draw() -> None:
     with pytest.raises(ValueError, match="cell_pixels is 5"):
         letter_render.rgb(np.zeros((3, 3), int), (0, 0), cell_pixels=5)
+
+
+def test_a_turned_world_is_the_same_world() -> None:
+    """A step and then a turn shows what a turn and then the turned step shows."""
+    env = envs_jax.make("letter")
+    params, turns = env.default_params, env.symmetries
+    assert turns is not None
+    assert len(set(turns.cells)) == 8
+
+    @quick_jit
+    def seen(layout: jax.Array, action: jax.Array) -> jax.Array:
+        _, state = env.reset_to(layout, jax.random.key(0), params)
+        return env.step_env(jax.random.key(0), state, action, params)[0]
+
+    def turn(image: np.ndarray, cells: tuple[int, ...]) -> np.ndarray:
+        return image.reshape(env.size**2, -1)[np.array(cells)].reshape(image.shape)
+
+    middle = env.size // 2
+    layout = np.asarray(env.sample_layout(jax.random.key(0), params))
+    for cells, actions in zip(turns.cells, turns.actions, strict=True):
+        around = turn(np.roll(layout, (middle, middle), (0, 1)), cells)
+        turned = np.roll(around, (-middle, -middle), (0, 1))
+        for action in range(env.num_actions):
+            now = turn(np.asarray(seen(layout, action)), cells)
+            np.testing.assert_array_equal(seen(turned, actions[action]), now)
+    assert envs_jax.make("letter", size=6).symmetries is None
