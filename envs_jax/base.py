@@ -87,17 +87,15 @@ class Box:
 
 @dataclasses.dataclass(frozen=True)
 class Symmetries:
-    """Ways to turn a world of images so that it stays the same world.
+    """Says that a world of square images stays the same world when it is turned or reflected.
 
-    Seen through turn k, ``plane.reshape(-1)[cells[k]]`` shows what ``plane`` shows now, and action ``actions[k][a]``
-    does what action ``a`` does now. Hashable, so that it can be a static attribute of a network.
+    Turn k = 4t + 2r + c transposes the image if t, then reverses its rows if r, and its columns if c. Hashable, so that
+    it can be a static attribute of a network.
 
     Attributes:
-        cells: a permutation of the image's S cells for each of K turns.
-        actions: a permutation of the A actions for each.
+        actions: for each of the 8 turns, which action does in the turned world what action a does now, for all A.
     """
 
-    cells: tuple[tuple[int, ...], ...]
     actions: tuple[tuple[int, ...], ...]
 
 
@@ -136,7 +134,7 @@ class Environment(abc.ABC):
 
     @property
     def symmetries(self) -> Symmetries | None:
-        """How images can be turned without changing the world; ``None`` where there is nothing to say."""
+        """Set where turning all images changes nothing but the actions' names."""
         return None
 
     @property

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import string
 from typing import Any
 
@@ -125,14 +126,11 @@ class Letter(Environment):
         """The eight turns and reflections of a grid whose middle cell is the agent's; of odd sizes only."""
         if self.size % 2 == 0:
             return None
-        index = np.arange(self.size**2).reshape(self.size, self.size)
-        turns = [(axes, rows, columns) for axes in ((0, 1), (1, 0)) for rows in (1, -1) for columns in (1, -1)]
-        cells, actions = [], []
-        for axes, rows, columns in turns:
-            cells.append(tuple(int(cell) for cell in index.transpose(axes)[::rows, ::columns].reshape(-1)))
-            turned = MOVES[:, list(axes)] * np.array([rows, columns])
+        actions = []
+        for axes, rows, columns in itertools.product(([0, 1], [1, 0]), (1, -1), (1, -1)):
+            turned = MOVES[:, axes] * np.array([rows, columns])
             actions.append(tuple(int(np.flatnonzero((move == MOVES).all(1))[0]) for move in turned))
-        return Symmetries(cells=tuple(cells), actions=tuple(actions))
+        return Symmetries(actions=tuple(actions))
 
     def sample_layout(self, key: jax.Array, params: EnvParams) -> jax.Array:
         """A random layout, int8 ``[n, n]``: uniform over those in which every letter can be reached."""

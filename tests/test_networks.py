@@ -16,7 +16,7 @@ import pytest
 
 import envs_jax
 from hrlspec.agent import Agent
-from hrlspec.networks.controller import Instruction
+from hrlspec.networks.controller import TURNS, Instruction, turned
 from hrlspec.networks.encoder import patches
 from hrlspec.networks.planner import MASKED
 from hrlspec.spec import TaskState, TaskTree, initial, open_edges
@@ -263,9 +263,8 @@ def test_the_low_level_turns_with_the_world() -> None:
         observation, _ = env.reset(jax.random.key(seed), env.default_params)
         planes, shared = env.proposition_view(observation)
         outputs, value = control((planes, shared))
-        for cells, actions in zip(turns.cells, turns.actions, strict=True):
-            turned = planes.reshape(len(planes), -1)[:, np.array(cells)].reshape(planes.shape)
-            again, same = control((turned, shared))
+        for bits, actions in zip(TURNS, turns.actions, strict=True):
+            again, same = control((turned(planes, *bits), shared))
             np.testing.assert_allclose(np.asarray(again)[np.array(actions)], outputs, rtol=1e-4, atol=1e-4)
             np.testing.assert_allclose(same, value, rtol=1e-4, atol=1e-4)
         straight += len(np.unique(np.round(np.asarray(outputs), 3)))

@@ -6,6 +6,9 @@ Paper, "Low-level Module". Axes: **N** tree nodes, **P** atomic propositions, **
 
 from __future__ import annotations
 
+import itertools
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -40,29 +43,45 @@ def turn(planes: jax.Array, symmetries: Symmetries) -> tuple[jax.Array, jax.Arra
     """Turns images by role so that the nearest goal, and then what comes after it, lies in one sector.
 
     Args:
-        planes: float32 ``[R, H, W]``, the agent in the middle: the goal, what to avoid, then what lies ahead.
-        symmetries: K ways to turn them.
+        planes: float32 ``[R, H, H]``, the agent in the middle: the goal, what to avoid, then what lies ahead.
+        symmetries: says that they may be turned.
 
     Returns:
         The images, and for each action its place among the turned ones, int32 ``[A]``.
     """
-    cells = np.array(symmetries.cells)
-    flat = planes.reshape(planes.shape[0], -1)
-    # What is seen of each goal, one number for every turn, which is largest where the nearest lies in the sector. Turning
-    # the images back turns the weights forth, hence their inverse permutation.
-    seen = (flat @ sector_weights(planes.shape[1], planes.shape[2])[np.argsort(cells)].T).T
-    score = seen[:, 0] + (0.05 * seen[:, 2:].sum(-1) if planes.shape[0] > 2 else 0.0)
+    size = planes.shape[-1]
+    # What is seen of each goal, one number for every turn, which is largest where the nearest lies in the sector.
+    # Turning the images back turns the weights forth, hence their inverse permutation.
+    cells = np.array([turned(np.arange(size**2).reshape(size, size), *bits).reshape(-1) for bits in TURNS])
+    seen = planes.reshape(planes.shape[0], -1) @ sector_weights(size)[np.argsort(cells)].T
+    score = seen[0] + (0.05 * seen[2:].sum(0) if planes.shape[0] > 2 else 0.0)
     best = jnp.argmax(score)
-    turned = flat[:, jnp.asarray(cells)[best]].reshape(planes.shape)
-    return turned, jnp.asarray(symmetries.actions, jnp.int32)[best]
+    # One select after the other: to gather by an index that is computed takes longer. The barrier keeps XLA from computing
+    # what the images are made of anew in each branch of each select.
+    planes = jax.lax.optimization_barrier(planes)
+    for which in np.eye(3, dtype=bool):
+        wanted = jnp.asarray([bool((bits & which).any()) for bits in np.array(TURNS)])[best]
+        planes = jnp.where(wanted, turned(planes, *which), planes)
+    return planes, jnp.asarray(symmetries.actions, jnp.int32)[best]
 
 
-def sector_weights(height: int, width: int) -> np.ndarray:
-    """Weights ``[H·W]`` that fall with the distance from the middle, and for equal distance prefer a sector."""
-    rows, columns = np.divmod(np.arange(height * width), width)
-    down, right = rows - height // 2, columns - width // 2
-    # Near cells outweigh far ones, so the nearest goal decides; where it lies on an axis, what is farther breaks the tie.
-    return ((2 + down / height + right / (3 * width)) * 3.0 ** -(np.abs(down) + np.abs(right))).astype(np.float32)
+TURNS = tuple(itertools.product((False, True), repeat=3))
+"""Transpose, reverse rows, reverse columns: in the order of :class:`envs_jax.Symmetries`."""
+
+
+def turned(image: Any, transpose: bool, rows: bool, columns: bool) -> Any:
+    """An image ``[..., H, W]`` after one turn (numpy or JAX)."""
+    image = image.swapaxes(-1, -2) if transpose else image
+    image = image[..., ::-1, :] if rows else image
+    return image[..., ::-1] if columns else image
+
+
+def sector_weights(size: int) -> np.ndarray:
+    """Weights ``[size²]`` that fall with the distance from the middle, and for equal distance prefer a sector."""
+    rows, columns = np.divmod(np.arange(size**2), size)
+    down, right = rows - size // 2, columns - size // 2
+    # Near cells outweigh far ones, so the nearest goal decides; where it is on an axis, what is farther breaks the tie.
+    return ((2 + down / size + right / (3 * size)) * 3.0 ** -(np.abs(down) + np.abs(right))).astype(np.float32)
 
 
 class Controller(nn.Module):
@@ -110,15 +129,15 @@ class Controller(nn.Module):
         if self.config.roles:
             # By role the encoder need not push the whole observation through its latent to find the goal afterwards.
             planes = jnp.tensordot(jnp.concatenate([told.reach[None], told.avoid[None], told.ahead]), planes, axes=1)
-        turned = None
+        order = None
         if self.config.roles and self.config.symmetric and self.symmetries:
-            planes, turned = turn(planes, self.symmetries)
+            planes, order = turn(planes, self.symmetries)
         latent = nn.relu(self.encoder(planes, shared))
         # With the planner's advice there is a plan, and what remains is the rest of the plan.
         future = self.task_embedding.of_way(told.ahead) if self.config.advice else told.future
         x = jnp.concatenate([latent, told.reach, told.avoid, future])
         outputs = self.actor(x)
-        return outputs if turned is None else outputs[turned], self.critic(x)[0]
+        return outputs if order is None else outputs[order], self.critic(x)[0]
 
     def everything(self, view: tuple[jax.Array, jax.Array], tree: TaskTree) -> tuple[jax.Array, jax.Array]:
         """Touches every parameter, for initialisation."""
