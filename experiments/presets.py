@@ -33,6 +33,8 @@ def preset(env_name: str, recipe: str, reward_set: int, method: str) -> Config:
     if reward_set == 2:
         # Returns reach 18; and a bonus at the end of a long branch must outweigh a short one.
         config = dataclasses.replace(config, value_scale=5.0, discount=0.97)
+        # A letter without a role in the task can earn a bonus, or cost one.
+        config = dataclasses.replace(config, network=dataclasses.replace(config.network, names=True))
     if method == "myopic-low":
         config = dataclasses.replace(config, future_embedding=False)
     if method == "no-er":

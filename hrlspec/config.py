@@ -40,6 +40,9 @@ class NetworkConfig:
     roles: bool = False
     """Task-conditioned encoding: the low level sees the observation by role (the goal p₊, the forbidden p₋, what comes
     1, 2, ... sub-tasks later) instead of by name. Off encodes the observation without the task, as in the paper."""
+    names: bool = False
+    """Whether the low level sees the observation by role and by name: where rewards depend on propositions that have no
+    role in the task."""
     symmetric: bool = False
     """Whether the low level sees the world turned so that its goal lies in one sector; in environments that say how
     their world can be turned, seen by role. What is learned in one direction is then known in all."""

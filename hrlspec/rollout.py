@@ -142,7 +142,7 @@ def collect(
         return jax.vmap(agent.reach_values, in_axes=(None, 0))(params, view).max(-1)
 
     def step(collector: Collector, inputs: tuple[jax.Array, ...]) -> tuple[Collector, Trajectory]:
-        plan_noise, noise, keys = inputs
+        plan_noise, noise, keys, last = inputs
         before, decision = collector.worker, collector.decision
         action, log_prob, value, shielded = act(agent, params, book, before, noise, shield=config.shield.mode != "off")
         step_keys, reset_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
@@ -151,11 +151,15 @@ def collect(
         started = collector.started + ended
         fresh = jax.tree.map(lambda x: x[envs, started % pool_size], pool)
         after = restart_where(agent, machine, worker, ended, fresh.layout, fresh.task, reset_keys, book)
-        # One pass of the planner serves the decisions that are due and the values of truncated states.
+        # One pass of the planner serves the decisions that are due, the values of truncated states, and in the end
+        # those of all states reached: compiled once.
         both = jax.tree.map(lambda *x: jnp.concatenate(x), after, worker)
-        needed = jnp.concatenate([after.awaiting, outcome.truncated])
+        needed = jnp.concatenate([after.awaiting | last, outcome.truncated])
         plan_noise = jnp.concatenate([plan_noise, jnp.zeros_like(plan_noise)])
         choice, ahead, plan_log_prob, plan_value = plan_where(agent, params, book, both, needed, plan_noise)
+        choice = jnp.where(after.awaiting, choice[:num_envs], after.assigned)
+        ahead = jnp.where(after.awaiting[:, None, None], ahead[:num_envs], after.ahead)
+        bootstrap = jnp.where(outcome.truncated, plan_value[num_envs:], plan_value[:num_envs])
         record = Trajectory(
             view=before.view,
             task=before.task,
@@ -177,32 +181,25 @@ def collect(
             reward=outcome.reward,
             terminated=outcome.terminated,
             truncated=outcome.truncated,
-            bootstrap=plan_value[num_envs:],
-            plan_bootstrap=plan_value[num_envs:],
+            bootstrap=bootstrap,
+            plan_bootstrap=bootstrap,
             reach_value=reach_value(params, worker.view),
             satisfied=outcome.satisfied,
             level=collector.level,
         )
         collector = Collector(
-            worker=dataclasses.replace(
-                after, assigned=choice[:num_envs], ahead=ahead[:num_envs], awaiting=jnp.zeros(num_envs, bool)
-            ),
+            worker=dataclasses.replace(after, assigned=choice, ahead=ahead, awaiting=jnp.zeros(num_envs, bool)),
             decision=Decision(after.awaiting, plan_log_prob[:num_envs], plan_value[:num_envs]),
             level=jnp.where(ended, fresh.level, collector.level),
             started=started,
         )
         return collector, record
 
-    inputs = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), jax.vmap(randomness)(envs))
+    last = jnp.arange(config.num_steps) == config.num_steps - 1
+    inputs = (*jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), jax.vmap(randomness)(envs)), last)
     collector = dataclasses.replace(collector, started=jnp.zeros(num_envs, jnp.int32))
     collector, trajectory = jax.lax.scan(step, collector, inputs)
     worker = collector.worker
     low = act(agent, params, book, worker, jnp.zeros((num_envs, *agent.actions.noise_shape)), shield=False)[2]
-    noise = jnp.zeros((num_envs, num_nodes))
-    high = plan_where(agent, params, book, worker, jnp.ones(num_envs, bool), noise)[3]
-    cut = trajectory.truncated[-1]
-    return collector, dataclasses.replace(
-        trajectory,
-        bootstrap=trajectory.bootstrap.at[-1].set(jnp.where(cut, trajectory.bootstrap[-1], low)),
-        plan_bootstrap=trajectory.plan_bootstrap.at[-1].set(jnp.where(cut, trajectory.plan_bootstrap[-1], high)),
-    )
+    low = jnp.where(trajectory.truncated[-1], trajectory.bootstrap[-1], low)
+    return collector, dataclasses.replace(trajectory, bootstrap=trajectory.bootstrap.at[-1].set(low))

@@ -39,12 +39,13 @@ class Instruction:
     future: jax.Array
 
 
-def turn(planes: jax.Array, symmetries: Symmetries) -> tuple[jax.Array, jax.Array]:
+def turn(planes: jax.Array, symmetries: Symmetries, lookahead: int) -> tuple[jax.Array, jax.Array]:
     """Turns images by role so that the nearest goal, and then what comes after it, lies in one sector.
 
     Args:
-        planes: float32 ``[R, H, H]``, the agent in the middle: the goal, what to avoid, then what lies ahead.
+        planes: float32 ``[R, H, H]``, the agent in the middle: the goal, what to avoid, what lies ahead, anything else.
         symmetries: says that they may be turned.
+        lookahead: images of what lies ahead.
 
     Returns:
         The images, and for each action its place among the turned ones, int32 ``[A]``.
@@ -54,10 +55,10 @@ def turn(planes: jax.Array, symmetries: Symmetries) -> tuple[jax.Array, jax.Arra
     # Turning the images back turns the weights forth, hence their inverse permutation.
     cells = np.array([turned(np.arange(size**2).reshape(size, size), *bits).reshape(-1) for bits in TURNS])
     seen = planes.reshape(planes.shape[0], -1) @ sector_weights(size)[np.argsort(cells)].T
-    score = seen[0] + (0.05 * seen[2:].sum(0) if planes.shape[0] > 2 else 0.0)
+    score = seen[0] + 0.05 * seen[2 : 2 + lookahead].sum(0)
     best = jnp.argmax(score)
-    # One select after the other: to gather by an index that is computed takes longer. The barrier keeps XLA from computing
-    # what the images are made of anew in each branch of each select.
+    # One select after the other: to gather by an index that is computed takes longer. The barrier keeps XLA from
+    # computing what the images are made of anew in each branch of each select.
     planes = jax.lax.optimization_barrier(planes)
     for which in np.eye(3, dtype=bool):
         wanted = jnp.asarray([bool((bits & which).any()) for bits in np.array(TURNS)])[best]
@@ -128,10 +129,11 @@ class Controller(nn.Module):
         planes, shared = view
         if self.config.roles:
             # By role the encoder need not push the whole observation through its latent to find the goal afterwards.
-            planes = jnp.tensordot(jnp.concatenate([told.reach[None], told.avoid[None], told.ahead]), planes, axes=1)
+            roles = jnp.tensordot(jnp.concatenate([told.reach[None], told.avoid[None], told.ahead]), planes, axes=1)
+            planes = jnp.concatenate([roles, planes]) if self.config.names else roles
         order = None
         if self.config.roles and self.config.symmetric and self.symmetries:
-            planes, order = turn(planes, self.symmetries)
+            planes, order = turn(planes, self.symmetries, told.ahead.shape[0])
         latent = nn.relu(self.encoder(planes, shared))
         # With the planner's advice there is a plan, and what remains is the rest of the plan.
         future = self.task_embedding.of_way(told.ahead) if self.config.advice else told.future
