@@ -21,7 +21,13 @@ MAY_FAIL = {"flatworld", "zone", "zone-nm"}
 """Environments whose episodes end where the square does."""
 
 
-@pytest.fixture(scope="module", params=envs_jax.registered())
+# Between solid walls MJX takes a minute to compile for each test.
+PRESETS = [
+    pytest.param(name, marks=[pytest.mark.slow] if name == "zone-ltl2action" else []) for name in envs_jax.registered()
+]
+
+
+@pytest.fixture(scope="module", params=PRESETS)
 def env(request: pytest.FixtureRequest) -> envs_jax.Environment:
     return envs_jax.make(request.param)
 
