@@ -68,6 +68,10 @@ class PPOConfig:
     clip: float = 0.2
     entropy: float = 0.002
     final_entropy: float = 0.002
+    entropy_floor: float = 0.0
+    """Mean entropy (nats) that the policy is kept near or above at first: below it the entropy's weight grows by twice
+    what is missing."""
+    final_entropy_floor: float = 0.0
     value_coefficient: float = 0.5
     expectile: float = 0.5
     """What the critic learns of the returns: 0.5 their mean, above it an optimistic expectile, which in deterministic

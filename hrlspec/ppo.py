@@ -69,9 +69,12 @@ def gradient_step(
     return params, optimiser_state, {**metrics, "grad_norm": norm, "skipped": 1.0 - finite}
 
 
-def annealed_rates(config: PPOConfig, progress: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Learning rate and entropy coefficient at this point of the run."""
-    return (
-        annealed(config.learning_rate, config.final_learning_rate, progress),
-        annealed(config.entropy, config.final_entropy, progress),
-    )
+def entropy_loss(randomness: jax.Array, settings: PPOConfig, progress: jax.Array) -> jax.Array:
+    """Minus the weighted mean entropy ``randomness``, and the square of what it lacks of the floor.
+
+    Near the optimum normalised advantages are mostly noise, which drives a policy to certainty; what keeps it from there
+    must grow as it gets near.
+    """
+    weight = annealed(settings.entropy, settings.final_entropy, progress)
+    floor = annealed(settings.entropy_floor, settings.final_entropy_floor, progress)
+    return jnp.maximum(floor - randomness, 0.0) ** 2 - weight * randomness

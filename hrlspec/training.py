@@ -164,10 +164,10 @@ class Trainer:
         params, optimisers, metrics = dict(state.params), dict(state.optimisers), {}
 
         def train(name: str, key: jax.Array, batch: Any, settings: PPOConfig, loss: Callable[..., Any]) -> None:
-            rate, entropy = ppo.annealed_rates(settings, progress)
+            rate = ppo.annealed(settings.learning_rate, settings.final_learning_rate, progress)
             params[name], optimisers[name], result = _fit(
                 key,
-                lambda p, sample: loss(agent, p, sample, settings, entropy),
+                lambda p, sample: loss(agent, p, sample, settings, progress),
                 params[name],
                 optimisers[name],
                 transforms[name],
@@ -195,7 +195,7 @@ class Trainer:
 
 
 def controller_loss(
-    agent: Agent, params: Any, batch: LowBatch, settings: PPOConfig, entropy_weight: jax.Array
+    agent: Agent, params: Any, batch: LowBatch, settings: PPOConfig, progress: jax.Array
 ) -> tuple[jax.Array, Metrics]:
     """PPO loss of the low level on a minibatch ``[V, T]``; steps the shield replaced count for the value alone."""
     own = {"controller": params}
@@ -210,12 +210,12 @@ def controller_loss(
     policy = ppo.policy_loss(log_prob, flat(batch.log_prob), advantage, on_policy, settings.clip)
     value_loss = ppo.value_loss(value, flat(batch.target), valid, settings.expectile)
     randomness = ppo.masked_mean(jax.vmap(agent.actions.entropy)(outputs), on_policy)
-    loss = policy + settings.value_coefficient * value_loss - entropy_weight * randomness
+    loss = policy + settings.value_coefficient * value_loss + ppo.entropy_loss(randomness, settings, progress)
     return loss, {"policy_loss": policy, "value_loss": value_loss, "entropy": randomness}
 
 
 def planner_loss(
-    agent: Agent, params: Any, batch: PlanBatch, settings: PPOConfig, entropy_weight: jax.Array
+    agent: Agent, params: Any, batch: PlanBatch, settings: PPOConfig, progress: jax.Array
 ) -> tuple[jax.Array, Metrics]:
     """PPO and TransE loss of the planner on a minibatch ``[B]`` (eqs. 4 and 5)."""
     config = agent.config
@@ -231,7 +231,7 @@ def planner_loss(
     policy = ppo.policy_loss(log_prob, batch.log_prob, advantage, free, settings.clip)
     value_loss = ppo.value_loss(value, batch.target, batch.valid, settings.expectile)
     randomness = ppo.masked_mean(jax.vmap(choices.entropy)(logits), free)
-    loss = policy + settings.value_coefficient * value_loss - entropy_weight * randomness
+    loss = policy + settings.value_coefficient * value_loss + ppo.entropy_loss(randomness, settings, progress)
     metrics = {"policy_loss": policy, "value_loss": value_loss, "entropy": randomness}
     if config.transe:
         metrics["transe_loss"] = transe_loss(agent, params, batch)
@@ -276,10 +276,10 @@ def reach_batch(agent: Agent, trajectory: Trajectory) -> tuple[Any, ...]:
 
 
 def reach_loss(
-    agent: Agent, params: Any, batch: tuple[Any, ...], settings: PPOConfig, entropy_weight: jax.Array
+    agent: Agent, params: Any, batch: tuple[Any, ...], settings: PPOConfig, progress: jax.Array
 ) -> tuple[jax.Array, Metrics]:
     """Squared error of Q(s, g, a) for all goals g (paper, "Avoiding Propositions")."""
-    del settings, entropy_weight
+    del settings, progress
     view, action, target = jax.tree.map(flat, batch)
     values = jax.vmap(agent.reach_values_of, in_axes=(None, 0, 0))({"reach_critic": params}, view, action)
     loss = ((values - target) ** 2).mean()
