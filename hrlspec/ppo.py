@@ -72,8 +72,8 @@ def gradient_step(
 def entropy_loss(randomness: jax.Array, settings: PPOConfig, progress: jax.Array) -> jax.Array:
     """Minus the weighted mean entropy ``randomness``, and the square of what it lacks of the floor.
 
-    Near the optimum normalised advantages are mostly noise, which drives a policy to certainty; what keeps it from there
-    must grow as it gets near.
+    Near the optimum normalised advantages are mostly noise, which drives a policy to certainty; what keeps it from
+    there must grow as it gets near.
     """
     weight = annealed(settings.entropy, settings.final_entropy, progress)
     floor = annealed(settings.entropy_floor, settings.final_entropy_floor, progress)

@@ -63,9 +63,22 @@ def test_masked_samples_with_senseless_log_probabilities_do_no_harm() -> None:
 
 
 def test_annealing() -> None:
-    settings = PPOConfig(learning_rate=1.0, final_learning_rate=0.5, entropy=0.2, final_entropy=0.0)
-    for progress, rate, entropy in ((0, 1.0, 0.2), (0.5, 0.75, 0.1), (1, 0.5, 0), (3, 0.5, 0)):
-        np.testing.assert_allclose(ppo.annealed_rates(settings, jnp.float32(progress)), [rate, entropy], atol=1e-7)
+    for progress, value in ((0, 1.0), (0.5, 0.75), (1, 0.5), (3, 0.5)):
+        assert float(ppo.annealed(1.0, 0.5, jnp.float32(progress))) == pytest.approx(value)
+
+
+def test_entropy_weighs_more_the_more_of_it_is_missing() -> None:
+    settings = PPOConfig(entropy=0.2, final_entropy=0.0, entropy_floor=0.5, final_entropy_floor=0.1)
+    slope = jax.grad(ppo.entropy_loss)
+    for progress, entropy, weight in (
+        (0, 0.7, 0.2),
+        (0, 0.4, 0.2 + 0.2),
+        (0.5, 0.2, 0.1 + 0.2),
+        (1, 0.2, 0),
+        (1, 0, 0.2),
+    ):
+        found = float(slope(jnp.float32(entropy), settings, jnp.float32(progress)))
+        assert found == pytest.approx(-weight, abs=1e-6)
 
 
 def step(loss: Any, params: Any, clip: float = 1.0) -> Any:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.platform import with_loop_option
+from experiments.platform import with_code_level, with_loop_option
 
 ROOT = Path(__file__).parents[2]
 OPTION = "xla_cpu_small_while_loop_byte_threshold=65536"
@@ -33,6 +33,12 @@ OPTION = "xla_cpu_small_while_loop_byte_threshold=65536"
 def test_the_option_for_loops(flags: str, version: tuple[int, ...], expected: str) -> None:
     assert with_loop_option(flags, version) == expected
     assert with_loop_option(expected, version) == expected
+
+
+def test_the_level_of_optimisation_is_the_users_to_choose() -> None:
+    assert with_code_level("--xla_a=1") == "--xla_a=1 --xla_backend_optimization_level=1"
+    for flags in ("--xla_backend_optimization_level=3 --xla_a=1", with_code_level("")):
+        assert with_code_level(flags) == flags
 
 
 SCRIPT = """
