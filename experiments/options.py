@@ -233,7 +233,8 @@ def _check_level(level: str, settings: PPOConfig) -> None:
         _at_least(1, f"{level}.{name}", getattr(settings, name))
     _between(0, 1, f"{level}.gae_lambda", settings.gae_lambda)
     _between(0, 1, f"{level}.expectile", settings.expectile)
-    for name in ("learning_rate", "final_learning_rate", "clip", "entropy", "final_entropy", "value_coefficient"):
+    weights = ("clip", "entropy", "final_entropy", "entropy_floor", "final_entropy_floor", "value_coefficient")
+    for name in ("learning_rate", "final_learning_rate", *weights):
         _between(0, 1e6, f"{level}.{name}", getattr(settings, name))
     _between(1e-9, 1e9, f"{level}.max_grad_norm", settings.max_grad_norm)
 

@@ -51,8 +51,16 @@ def hrlspec() -> Config:
         # It raises what bad instances lead to up to the planner's average guess, and so hides the difference.
         max_operator=False,
         unfinished=True,
-        # Enough entropy to the end: an agent without memory or chance goes in circles for ever.
-        low=PPOConfig(learning_rate=7e-4, epochs=2, minibatches=16, entropy=0.02, final_entropy=0.004),
+        low=PPOConfig(
+            learning_rate=7e-4,
+            epochs=2,
+            minibatches=16,
+            entropy=0.02,
+            final_entropy=0.004,
+            # An agent without memory or chance goes in circles for ever, and looks no farther than the nearest goal.
+            entropy_floor=0.12,
+            final_entropy_floor=0.03,
+        ),
         high=PPOConfig(learning_rate=3e-4, epochs=1, minibatches=4, entropy=0.005, final_entropy=0.005),
         network=NetworkConfig(
             # Seen by role the grid needs no convolution: a third of the time, and no worse.
@@ -83,6 +91,18 @@ def letter12(config: Config) -> Config:
     return dataclasses.replace(config, total_steps=6_000_000)
 
 
+def _continuous(config: Config, learning_rate: float) -> PPOConfig:
+    """Low-level PPO for Gaussians, whose entropy may be negative: a small weight to begin with, and no floor."""
+    return dataclasses.replace(
+        config.low,
+        learning_rate=learning_rate,
+        epochs=3,
+        entropy=0.003,
+        final_entropy=0.0,
+        entropy_floor=0.0,
+    )
+
+
 def walk(config: Config) -> Config:
     """A point that moves a tenth of a unit a step: episodes of hundreds of steps, and a decision in fifty."""
     return dataclasses.replace(
@@ -94,7 +114,7 @@ def walk(config: Config) -> Config:
         planner_share=64,
         # White noise stays within a unit of the start, and the nearest region is three away.
         noise_correlation=0.98,
-        low=dataclasses.replace(config.low, learning_rate=1e-3, epochs=3, entropy=0.003, final_entropy=0.0),
+        low=_continuous(config, learning_rate=1e-3),
         network=dataclasses.replace(config.network, encoder_mlp=(128, 128), planner_features=32, critic=(64, 64)),
         # At first some regions are found rarely; waiting for the last of them would waste the others.
         curriculum=dataclasses.replace(config.curriculum, promotion=0.85, window=256),
@@ -111,7 +131,7 @@ def zone(config: Config) -> Config:
         steps_per_slot=16,
         planner_share=64,
         noise_correlation=0.95,
-        low=dataclasses.replace(config.low, learning_rate=7e-4, epochs=3, entropy=0.003, final_entropy=0.0),
+        low=_continuous(config, learning_rate=7e-4),
         network=dataclasses.replace(config.network, latent=128, encoder_mlp=(128, 128), critic=(64, 64)),
         curriculum=dataclasses.replace(config.curriculum, levels=3, max_avoid=2, promotion=0.85, window=256),
     )

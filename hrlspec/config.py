@@ -70,7 +70,7 @@ class PPOConfig:
     final_entropy: float = 0.002
     entropy_floor: float = 0.0
     """Mean entropy (nats) that the policy is kept near or above at first: below it the entropy's weight grows by twice
-    what is missing."""
+    what is missing. 0: none, as for Gaussians, whose entropy may be negative."""
     final_entropy_floor: float = 0.0
     value_coefficient: float = 0.5
     expectile: float = 0.5

@@ -76,5 +76,7 @@ def entropy_loss(randomness: jax.Array, settings: PPOConfig, progress: jax.Array
     there must grow as it gets near.
     """
     weight = annealed(settings.entropy, settings.final_entropy, progress)
+    if not settings.entropy_floor:
+        return -weight * randomness
     floor = annealed(settings.entropy_floor, settings.final_entropy_floor, progress)
     return jnp.maximum(floor - randomness, 0.0) ** 2 - weight * randomness

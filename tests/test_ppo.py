@@ -70,6 +70,8 @@ def test_annealing() -> None:
 def test_entropy_weighs_more_the_more_of_it_is_missing() -> None:
     settings = PPOConfig(entropy=0.2, final_entropy=0.0, entropy_floor=0.5, final_entropy_floor=0.1)
     slope = jax.grad(ppo.entropy_loss)
+    plain = PPOConfig(entropy=0.2, final_entropy=0.0)
+    assert float(slope(jnp.float32(-3.0), plain, jnp.float32(0.5))) == pytest.approx(-0.1)
     for progress, entropy, weight in (
         (0, 0.7, 0.2),
         (0, 0.4, 0.2 + 0.2),
