@@ -54,7 +54,9 @@ def _children(edges: dict[int, tuple[int, frozenset[int], frozenset[int]]], node
 def test_rules(env_name, name):
     suite = load_suite(env_name, name)
     assert len(suite) == 200
-    fewest, most = {"reach_avoid_6": (1, 2), "reach_12": (0, 0)}.get(name, (0, 2))
+    fewest, most = {"reach_avoid_6": (1, 2), "reach_avoid": (1, 2), "reach_12": (0, 0), "reach": (0, 0)}.get(
+        name, (0, 2)
+    )
     several = 0
     for row in range(200):
         edges = _tree(env_name, name, row)
@@ -90,11 +92,16 @@ def test_rules(env_name, name):
                 assert paths == [6]
             case "reach_12":
                 assert paths == [12]
+            case "reach_avoid" | "reach":
+                assert len(paths) == 1
             case _:
                 pytest.fail(f"no rules for {name}")
     assert several >= (0 if name.startswith("reach") else 100)
+    depths = dict(zip(*np.unique(suite.depths, return_counts=True), strict=True))
     if name in ("dag", "wider", "branches"):
-        assert np.bincount(suite.depths)[2:].tolist() == [66, 67, 67]
+        assert depths == ({2: 100, 3: 100} if env_name.startswith("zone") else {2: 66, 3: 67, 4: 67})
+    if name in ("reach_avoid", "reach"):
+        assert depths == dict.fromkeys(range(2, 7) if name == "reach_avoid" else range(4, 13, 2), 40)
 
 
 def _canonical(edges: dict[int, tuple[int, frozenset[int], frozenset[int]]], node: int = 0) -> tuple:
