@@ -33,7 +33,7 @@ _COLORS = {
 _BACKGROUND = (250, 250, 248)
 _SIDE = (205, 205, 200)
 _INK = (30, 30, 34)
-_PATHS = ("#1f5fa8", "#c2452d", "#2e8b57", "#8a4fbf", "#b8860b", "#c2408f", "#4d4d4d", "#008b8b")
+PATH_COLORS = ("#1f5fa8", "#c2452d", "#2e8b57", "#8a4fbf", "#b8860b", "#c2408f", "#4d4d4d", "#008b8b")
 _SMALLEST = 64
 
 
@@ -215,7 +215,7 @@ def draw_path(
     starts = np.flatnonzero(np.diff(leg, prepend=-1))
     for first, last in zip(starts, [*starts[1:], len(leg)], strict=True):
         number = int(leg[first])
-        shade = color or _PATHS[number % len(_PATHS)]
+        shade = color or PATH_COLORS[number % len(PATH_COLORS)]
         label = labels.pop(number, None)  # Each is told once.
         ax.plot(*path[first : last + 1].T, color=shade, linewidth=2, solid_capstyle="round", label=label, zorder=3)
     ax.plot(*path[0], "o", color=color or "#1e1e22", markersize=6, zorder=4)

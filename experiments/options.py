@@ -220,8 +220,6 @@ def check_config(config: Config) -> None:
         sizes = getattr(network, field.name)
         least = 1 if field.name in ("latent", "planner_features", "planner_hidden", "task_features") else 0
         for size in sizes if isinstance(sizes, tuple) else (sizes,):
-            if isinstance(size, float):
-                continue
             _at_least(1 if isinstance(sizes, tuple) else least, f"network.{field.name}", size)
     _check_level("low", config.low)
     _check_level("high", config.high)

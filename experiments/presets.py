@@ -31,8 +31,8 @@ def preset(env_name: str, recipe: str, reward_set: int, method: str) -> Config:
     config = Config() if recipe == "paper" else hrlspec()
     config = _WORLDS.get(env_name, lambda config: config)(config)
     if reward_set == 2:
-        # Returns reach 18; and a bonus at the end of a long branch must outweigh a short one.
-        config = dataclasses.replace(config, value_scale=5.0, discount=0.97)
+        # Returns reach 18 in Letter; and a bonus at the end of a long branch must outweigh a short one.
+        config = dataclasses.replace(config, value_scale=5.0, discount=max(config.discount, 0.97))
         # A letter without a role in the task can earn a bonus, or cost one.
         config = dataclasses.replace(config, network=dataclasses.replace(config.network, names=True))
     if method == "myopic-low":
@@ -91,9 +91,12 @@ def letter12(config: Config) -> Config:
     return dataclasses.replace(config, total_steps=6_000_000)
 
 
-def _continuous(config: Config, learning_rate: float) -> PPOConfig:
-    """Low-level PPO for Gaussians, whose entropy may be negative: a small weight to begin with, and no floor."""
-    return dataclasses.replace(
+def _continuous(config: Config, learning_rate: float) -> Config:
+    """What worlds of small steps and Gaussian actions share: long rollouts, few decisions, coloured noise.
+
+    The entropy of a Gaussian may be negative: its weight is small to begin with, and there is no floor.
+    """
+    low = dataclasses.replace(
         config.low,
         learning_rate=learning_rate,
         epochs=3,
@@ -101,39 +104,41 @@ def _continuous(config: Config, learning_rate: float) -> PPOConfig:
         final_entropy=0.0,
         entropy_floor=0.0,
     )
+    return dataclasses.replace(
+        config,
+        num_steps=128,
+        steps_per_slot=16,
+        planner_share=64,
+        low=low,
+        network=dataclasses.replace(config.network, encoder_mlp=(128, 128), critic=(64, 64)),
+        # At first some goals are found rarely; waiting for the last of them would waste the others.
+        curriculum=dataclasses.replace(config.curriculum, promotion=0.85, window=256),
+    )
 
 
 def walk(config: Config) -> Config:
     """A point that moves a tenth of a unit a step: episodes of hundreds of steps, and a decision in fifty."""
+    config = _continuous(config, learning_rate=1e-3)
     return dataclasses.replace(
         config,
         total_steps=2_000_000,
         discount=0.99,
-        num_steps=128,
-        steps_per_slot=16,
-        planner_share=64,
         # White noise stays within a unit of the start, and the nearest region is three away.
         noise_correlation=0.98,
-        low=_continuous(config, learning_rate=1e-3),
-        network=dataclasses.replace(config.network, encoder_mlp=(128, 128), planner_features=32, critic=(64, 64)),
-        # At first some regions are found rarely; waiting for the last of them would waste the others.
-        curriculum=dataclasses.replace(config.curriculum, promotion=0.85, window=256),
+        network=dataclasses.replace(config.network, planner_features=32),
     )
 
 
 def zone(config: Config) -> Config:
     """A robot with inertia: episodes of up to 1,000 steps, zones seen through a lidar."""
+    config = _continuous(config, learning_rate=7e-4)
     return dataclasses.replace(
         config,
         total_steps=10_000_000,
         discount=0.998,
-        num_steps=128,
-        steps_per_slot=16,
-        planner_share=64,
         noise_correlation=0.95,
-        low=_continuous(config, learning_rate=7e-4),
-        network=dataclasses.replace(config.network, latent=128, encoder_mlp=(128, 128), critic=(64, 64)),
-        curriculum=dataclasses.replace(config.curriculum, levels=3, max_avoid=2, promotion=0.85, window=256),
+        network=dataclasses.replace(config.network, latent=128),
+        curriculum=dataclasses.replace(config.curriculum, levels=3, max_avoid=2),
     )
 
 

@@ -13,9 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from envs_jax import Environment, Letter, Walk, letter_render, walk_render
-from envs_jax.walk_render import Region, Scene
-
-COLORS = ("#1f5fa8", "#c2452d", "#2e8b57", "#8a4fbf", "#b8860b", "#c2408f", "#4d4d4d", "#008b8b")
+from envs_jax.walk_render import PATH_COLORS, Region, Scene
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +56,8 @@ def stage_of(env: Environment, layout: Any) -> Stage | None:
     if isinstance(env, Walk):
         return DiscStage(walk_render.walk_scene(env, layout))
     if hasattr(layout, "zones"):
+        from envs_jax.zone import BOUNDARY  # Zone's module is imported by those who use Zone alone
+
         zones = np.asarray(layout.zones)
         radius = float(env.radius)  # type: ignore[attr-defined]
         regions = [
@@ -65,7 +65,7 @@ def stage_of(env: Environment, layout: Any) -> Stage | None:
             for name, some in zip(env.propositions, zones, strict=True)
             for centre in some
         ]
-        return DiscStage(Scene(tuple(regions), -3.3, 3.3))
+        return DiscStage(Scene(tuple(regions), -BOUNDARY, BOUNDARY))
     return None
 
 
@@ -92,7 +92,7 @@ class LetterStage:
         grid = letter_render.rgb(self.layout, positions[0], cell_pixels=self.cell)
         ax.imshow(grid, extent=(-0.5, size - 0.5, size - 0.5, -0.5))
         for number, leg in enumerate(legs):
-            color = COLORS[number % len(COLORS)]
+            color = PATH_COLORS[number % len(PATH_COLORS)]
             for t in range(leg.first, leg.last + 1):
                 label = leg.label if t == leg.first else None
                 _draw_move(ax, positions[t], positions[t + 1], color, label, shift=0.06 * ((number + 1) % 5 - 2))

@@ -21,7 +21,7 @@ try:
         from brax.envs.base import Env, State, Wrapper
         from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 except ImportError as error:
-    raise ImportError('the brax adapter needs the extra "brax": pip install "hrlspec[brax]"') from error
+    raise ImportError('the brax adapter needs the extra "adapters": pip install "hrlspec[adapters]"') from error
 
 
 class BraxEnv(Env):

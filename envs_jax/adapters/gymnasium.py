@@ -23,7 +23,7 @@ try:
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 except ImportError as error:
-    raise ImportError('the Gymnasium adapter needs the extra "gymnasium": pip install "hrlspec[gymnasium]"') from error
+    raise ImportError('the Gymnasium adapter needs the extra "adapters": pip install "hrlspec[adapters]"') from error
 
 OPTIONS = ("task", "layout")
 
