@@ -1,7 +1,4 @@
-"""What the throughput scripts share: rates of the environment, of rollouts and of training, and compile times.
-
-Import it before JAX is first used: it sets the flags that XLA reads then.
-"""
+"""What the throughput scripts share: rates of the environment, of rollouts and of training, and compile times."""
 
 from __future__ import annotations
 
@@ -21,15 +18,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from experiments.platform import prepare
-
-prepare()
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import envs_jax
+from experiments.platform import prepare
 from experiments.presets import preset, rewards_of
 from hrlspec.agent import Agent
 from hrlspec.curriculum import draw_bank
@@ -183,6 +177,7 @@ def main(script: str, env: str, flags: CommonFlags, measure: Callable[[], Mappin
         flags: what to measure.
         measure: the entries about the environment alone.
     """
+    prepare(env)
     if flags.only_start:
         print(json.dumps(start(env, flags.recipes[0])))
         return

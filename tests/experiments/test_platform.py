@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import pytest
 
 from experiments.platform import with_code_level, with_loop_option
@@ -42,23 +43,24 @@ def test_the_level_of_optimisation_is_the_users_to_choose() -> None:
 
 
 SCRIPT = """
-import os
+import os, sys
 from experiments import platform
 import jax
 before = dict(os.environ)
-platform.prepare()
+platform.prepare(sys.argv[1])
 import jax.numpy as jnp
 assert float(jax.jit(lambda x: x + 1)(jnp.ones(()))) == 2  # XLA knows the flags
 print(jax.config.jax_compilation_cache_dir)
 print(jax.config.jax_persistent_cache_min_compile_time_secs)
+print(os.environ["XLA_FLAGS"])
 """
 
 
-def prepared(**environment: str) -> list[str]:
+def prepared(env: str = "letter", **environment: str) -> list[str]:
     names = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "XLA_FLAGS")
     clean = {name: value for name, value in os.environ.items() if name not in names}
     ended = subprocess.run(
-        [sys.executable, "-c", SCRIPT],
+        [sys.executable, "-c", SCRIPT, env],
         cwd=ROOT,
         env=clean | environment,
         capture_output=True,
@@ -66,19 +68,25 @@ def prepared(**environment: str) -> list[str]:
         timeout=120,
         check=True,
     )
-    return ended.stdout.split()
+    return ended.stdout.splitlines()
 
 
 def test_the_cache_belongs_to_user_and_version(tmp_path: Path) -> None:
     import jaxlib.version
 
-    folder, least = prepared(XDG_CACHE_HOME=str(tmp_path))
+    folder, least, flags = prepared(XDG_CACHE_HOME=str(tmp_path), JAX_PLATFORMS="cpu")
     assert folder == f"{tmp_path}/hrlspec/jaxlib-{jaxlib.version.__version__}"
     assert float(least) == 0.2
+    assert flags == with_code_level(with_loop_option("", jax.__version_info__))
+
+
+def test_physics_is_optimised_in_full() -> None:
+    *_, flags = prepared("zone-nm", JAX_PLATFORMS="cpu")
+    assert "optimization_level" not in flags
 
 
 def test_what_the_user_set_stays(tmp_path: Path) -> None:
     mine = str(tmp_path / "mine")
-    folder, least = prepared(JAX_COMPILATION_CACHE_DIR=mine, JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS="3")
+    folder, least, _ = prepared(JAX_COMPILATION_CACHE_DIR=mine, JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS="3")
     assert folder == mine
     assert float(least) == 3
