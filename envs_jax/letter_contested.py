@@ -43,8 +43,8 @@ def myopia_regret(layout: jax.Array, num_letters: int) -> jax.Array:
 def most_contested(key: jax.Array, regret: jax.Array, tries: int) -> tuple[jax.Array, jax.Array]:
     """The pair of letters with the largest regret among ``tries`` random ones, int32 ``[]`` each. Consumes the key."""
     num_letters = regret.shape[0]
-    keys = jax.random.split(key)
-    first = jax.random.randint(keys[0], (tries,), 0, num_letters)
-    second = (first + jax.random.randint(keys[1], (tries,), 1, num_letters)) % num_letters
+    chance = jax.random.uniform(key, (2, tries))
+    first = (chance[0] * num_letters).astype(jnp.int32)
+    second = (first + 1 + (chance[1] * (num_letters - 1)).astype(jnp.int32)) % num_letters
     best = jnp.argmax(regret[first, second])
     return first[best], second[best]

@@ -16,6 +16,7 @@ from experiments.errors import UserError
 from experiments.loop import Job
 from experiments.options import Experiment, environment_of
 from experiments.presets import rewards_of
+from experiments.programs import Program
 from experiments.suites import load_suite, reserved_hashes, suite_names
 from hrlspec.agent import Agent, Params
 from hrlspec.contested import can_contest
@@ -75,6 +76,10 @@ class Learner:
         self.env: Environment = environment_of(experiment)
         self.agent = Agent(self.env, experiment.config)
         self.trainer = Trainer(self.agent)
+        self._programs = {
+            "init": Program("init", Trainer.init, self.trainer),
+            "iterate": Program("iterate", Trainer.iterate, self.trainer),
+        }
         self.machine: RewardMachine = rewards_of(experiment.env, experiment.reward_set)
         self._reserved = reserved_hashes(experiment.env)
         self._reserved_on_device = jnp.asarray(self._reserved)
@@ -127,12 +132,16 @@ class Learner:
         )
 
     def _init(self) -> TrainState:
-        return self.trainer.init(jax.random.key(self.experiment.seed), self._bank_of(0), self.machine)
+        init = self._programs["init"]
+        state: TrainState = init(jax.random.key(self.experiment.seed), self._bank_of(0), self.machine)
+        return state
 
     def _iterate(self, state: TrainState, index: int) -> tuple[TrainState, Mapping[str, jax.Array]]:
-        return self.trainer.iterate(
-            state, self._bank_of(index // BANK_ITERATIONS), self.machine, self._reserved_on_device
+        bank = self._bank_of(index // BANK_ITERATIONS)
+        result: tuple[TrainState, Mapping[str, jax.Array]] = self._programs["iterate"](
+            state, bank, self.machine, self._reserved_on_device
         )
+        return result
 
     def _bank_of(self, number: int) -> TaskTree:
         """A bank depends on the seed and its number alone, so that a resumed run draws the same ones."""

@@ -73,7 +73,10 @@ def hrlspec() -> Config:
             # One sweep instead of 8 rounds: an eighth of the arithmetic, and no limit to look-ahead.
             planner_rounds=0,
             task_rounds=0,
-            planner_policy=(128,),
+            # It is asked at every decision about every node; with the low level's advice it need not be large.
+            planner_features=32,
+            planner_hidden=64,
+            planner_policy=(64,),
             child_embeddings=True,
             critic=(128, 128),
             # The learned correction alone misleads: it is trained on relabelled paths, all of which succeeded.
@@ -125,7 +128,6 @@ def walk(config: Config) -> Config:
         discount=0.99,
         # White noise stays within a unit of the start, and the nearest region is three away.
         noise_correlation=0.98,
-        network=dataclasses.replace(config.network, planner_features=32),
     )
 
 

@@ -105,5 +105,5 @@ def _cell(interval: Interval | None) -> str:
     estimate = f"{interval.estimate:.{1 if large else 3}f}"
     if math.isnan(interval.low):
         return estimate
-    low, high = (f"{bound:.1f}" if large else f"{bound:.2f}".replace("0.", ".", 1) for bound in interval[1:])
+    low, high = (f"{bound:.1f}" if large else f"{bound:.2f}".removeprefix("0") for bound in interval[1:])
     return f"{estimate} [{low},{high}]"

@@ -19,6 +19,7 @@ from envs_jax import Environment
 from hrlspec.actions import Distribution, distribution_over
 from hrlspec.config import Config
 from hrlspec.networks.controller import Controller, Instruction
+from hrlspec.networks.encoder import randomised
 from hrlspec.networks.planner import Planner
 from hrlspec.networks.reach_critic import ReachCritic
 from hrlspec.networks.tree import routes
@@ -76,15 +77,15 @@ class Agent:
 
     def init(self, key: jax.Array) -> Params:
         """Fresh parameters: ``planner``, ``controller``, ``reach_critic``. The key is consumed."""
-        keys = jax.random.split(key, 3)
         view = self.env.proposition_view(jnp.zeros(self.env.observation_shape))
         tree = _blank_tree(self.env.num_propositions)
         no_advice = jnp.zeros(tree.num_nodes)
-        return {
-            "planner": self.planner.init(keys[0], view, tree, initial(tree), no_advice),
-            "controller": self.controller.init(keys[1], view, tree, method="everything"),
-            "reach_critic": self.reach_critic.init(keys[2], view),
+        deviations = {
+            "planner": self.planner.init(key, view, tree, initial(tree), no_advice),
+            "controller": self.controller.init(key, view, tree, method="everything"),
+            "reach_critic": self.reach_critic.init(key, view),
         }
+        return cast(Params, randomised(key, deviations))
 
     def instruct(self, params: Params, tree: TaskTree) -> Instruction:
         """The instruction for every edge of one task, leading axis N; it says nothing of the future for Myopic-low."""
@@ -100,28 +101,28 @@ class Agent:
     def plan(self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction) -> Estimate:
         """The planner on one environment: logits over edges ``[N]`` and the value of the remaining task ``[]``."""
         batch = jax.tree.map(lambda x: x[None], (view, tree, state, told))
-        logits, value, _ = self.plan_ahead(params, *batch)
+        logits, value, _, _ = self.plan_ahead(params, *batch)
         return logits[0], value[0]
 
     def plan_ahead(
         self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """The planner on B environments, and what the low level is told to look ahead to.
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """The planner on B environments, and what the low level says and is told.
 
         Returns:
-            Logits over edges ``[B, N]``, values ``[B]``, and what lies ahead after each edge, ``[B, N, D, P]``.
+            Logits over edges ``[B, N]``, values ``[B]``, the low level's advice on each edge ``[B, N]``, and what lies
+            ahead after it, ``[B, N, D, P]``.
         """
-        if self.config.network.advice:
-            advice, ahead = self.advise(params, view, tree, state, told)
-        else:
-            advice, ahead = jnp.zeros(tree.parent.shape), told.ahead
+        advice, ahead = self.advise(params, view, tree, state, told)
         plan: Any = jax.vmap(self.planner.apply, in_axes=(None, 0, 0, 0, 0))
-        return (*plan(params["planner"], view, tree, state, advice), ahead)
+        return (*plan(params["planner"], view, tree, state, advice), advice, ahead)
 
     def advise(
         self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
     ) -> tuple[jax.Array, jax.Array]:
         """The low level's advice in B environments: its value of each feasible edge and the best way on to a leaf.
+
+        Zeros, and what all ways have in common, where the configuration gives advice no weight.
 
         Every way from the current node to a leaf is a sequence of sub-tasks, which the low level's critic values
         much better than a tree. Most tasks have few ways, so all that exist are valued side by side.
@@ -130,6 +131,8 @@ class Agent:
             Values of edges ``[B, N]``, without gradient, and what lies ahead on each edge's best way,
             ``[B, N, D, P]``.
         """
+        if not self.config.network.advice:
+            return jnp.zeros(tree.parent.shape), told.ahead
         edge, known, ways = jax.vmap(self._ways)(tree, state, told)
         num_ways = known.shape[1]
 

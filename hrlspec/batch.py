@@ -57,7 +57,7 @@ class PlanBatch:
     reached: jax.Array  # bool [B, P], p₊ of the sub-task that was completed
     next_view: View  # observation when it was
     completed: jax.Array  # bool, it was, within the episode
-    advice: jax.Array  # float32 [B, N], the low level's values at the start of the update; zeros when not used
+    advice: jax.Array  # float32 [B, N], what the low level said of each edge; zeros when not used
     valid: jax.Array  # bool
     chosen: jax.Array  # bool, counts in the policy loss
 
@@ -105,6 +105,7 @@ class _Experience:
     decided: jax.Array
     plan_log_prob: jax.Array
     plan_value: jax.Array
+    advice: jax.Array
     reward: jax.Array
     terminated: jax.Array
     truncated: jax.Array
@@ -137,6 +138,7 @@ def _originals(config: Config, book: TaskBook, rollout: Trajectory, num_slots: i
         decided=rollout.decided,
         plan_log_prob=rollout.plan_log_prob,
         plan_value=rollout.plan_value,
+        advice=rollout.advice,
         reward=rollout.reward / config.value_scale,
         terminated=rollout.terminated,
         truncated=rollout.truncated,
@@ -203,17 +205,24 @@ def _copies(
     action = rollout.action.reshape((copies * num_steps, *rollout.action.shape[2:]))
     log_prob = jax.vmap(agent.actions.log_prob)(outputs, action)
 
-    def plan(inputs: tuple[View, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    # A copy ends in success, its returns are known: the planner's opinion is asked only where something depends on it.
+    asked = config.relabel.planner_policy or config.max_operator
+
+    def plan(inputs: tuple[View, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
         view, row, node, edge = inputs
         tree, told = jax.tree.map(lambda x: x[row], (fresh.tree, fresh.told))
         state = dataclasses.replace(jax.vmap(initial)(tree), node=node)
-        logits, value, _ = agent.plan_ahead(params, view, tree, state, told)
-        return jax.vmap(Categorical(logits.shape[-1]).log_prob)(logits, edge), value
+        if not asked:
+            unknown = jnp.zeros(row.shape)
+            return unknown, unknown, agent.advise(params, view, tree, state, told)[0]
+        logits, value, advice, _ = agent.plan_ahead(params, view, tree, state, told)
+        return jax.vmap(Categorical(logits.shape[-1]).log_prob)(logits, edge), value, advice
 
     decided = new.decided.reshape(-1)
     nothing = jnp.zeros(decided.shape)
     inputs = (view, row, new.node.reshape(-1), edge)
-    plan_log_prob, plan_value = in_groups(plan, decided, inputs, (nothing, nothing), group=128)
+    outputs = nothing, nothing, jnp.zeros((*decided.shape, num_nodes))
+    plan_log_prob, plan_value, advice = in_groups(plan, decided, inputs, outputs, group=128)
 
     def shaped(x: jax.Array) -> jax.Array:
         return x.reshape((copies, num_steps, *x.shape[1:]))
@@ -232,6 +241,7 @@ def _copies(
         decided=new.decided,
         plan_log_prob=shaped(plan_log_prob),
         plan_value=shaped(plan_value),
+        advice=shaped(advice),
         reward=new.reward / config.value_scale,
         terminated=new.terminated | ~new.valid,
         truncated=jnp.zeros_like(new.valid),
@@ -263,7 +273,7 @@ def _with_targets(key: jax.Array, config: Config, x: _Experience) -> tuple[LowBa
         *ends,
         *in_time(x.decided, x.plan_value, x.plan_bootstrap),
         discount=config.discount,
-        gae_lambda=config.high.gae_lambda,
+        gae_lambda=jnp.where(x.choice.T, config.high.gae_lambda, 1.0),
     )
     low = LowBatch(
         tree=x.tree,
@@ -313,7 +323,7 @@ def _pick_decisions(
         reached=x.reached[row, end],
         next_view=jax.tree.map(lambda a: a[row, after], x.view),
         completed=goes_on,
-        advice=jnp.zeros((size, x.blocked.shape[-1])),
+        advice=x.advice[row, time],
         valid=score >= 0,
         chosen=(score >= 0) & x.choice[row, time],
     )

@@ -48,11 +48,19 @@ def update(curriculum: Curriculum, finished: jax.Array, succeeded: jax.Array, co
     )
 
 
-def draw_levels(key: jax.Array, level: jax.Array, earlier: float, num_envs: int) -> jax.Array:
-    """Levels of the next tasks, int32 ``[E]``: the current one, or with probability ``earlier`` one already passed."""
-    coin, which = jax.random.split(key)
-    back = jax.random.bernoulli(coin, earlier, (num_envs,)) & (level > 0)
-    return jnp.where(back, jax.random.randint(which, (num_envs,), 0, jnp.maximum(level, 1)), level)
+def draw_levels(chance: jax.Array, level: jax.Array, earlier: float) -> jax.Array:
+    """Levels of the next tasks: the current one, or with probability ``earlier`` one already passed.
+
+    Args:
+        chance: float32 ``[2, S]``, uniform in [0, 1).
+        level: int32 ``[]``, the current one, 0-based.
+        earlier: a probability.
+
+    Returns:
+        int32 ``[S]``.
+    """
+    back = (chance[0] < earlier) & (level > 0)
+    return jnp.where(back, (chance[1] * level).astype(jnp.int32), level)
 
 
 def draw_bank(

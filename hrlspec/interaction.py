@@ -53,6 +53,7 @@ class Decision:
     made: jax.Array  # bool [E]
     log_prob: jax.Array  # float32 [E]
     value: jax.Array  # float32 [E]
+    advice: jax.Array  # float32 [E, N], what the low level said of each edge
 
 
 @struct.dataclass
@@ -93,10 +94,10 @@ def start(
 
 def plan_where(
     agent: Agent, params: Params, book: TaskBook, worker: Worker, needed: jax.Array, noise: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+) -> tuple[jax.Array, jax.Array, Decision]:
     """Runs the planner for the environments in ``needed`` alone.
 
-    Returns choices ``[E]``, what lies ahead of them ``[E, D, P]``, log-probabilities and values ``[E]``.
+    Returns choices ``[E]``, what lies ahead of them ``[E, D, P]``, and how they were made.
 
     Args:
         agent: the networks.
@@ -110,20 +111,20 @@ def plan_where(
     def decide(inputs: Any) -> tuple[jax.Array, ...]:
         view, task, state, noise = inputs
         tree, told = jax.tree.map(lambda x: x[task], (book.tree, book.told))
-        logits, value, ahead = agent.plan_ahead(params, view, tree, state, told)
+        logits, value, advice, ahead = agent.plan_ahead(params, view, tree, state, told)
         choice, log_prob = jax.vmap(Categorical(logits.shape[-1]).sample)(logits, noise)
-        return choice, ahead[jnp.arange(choice.shape[0]), choice], log_prob, value
+        return choice, ahead[jnp.arange(choice.shape[0]), choice], log_prob, value, advice
 
     nothing = jnp.zeros(needed.shape)
-    outputs = (worker.assigned, worker.ahead, nothing, nothing)
+    outputs = (worker.assigned, worker.ahead, nothing, nothing, jnp.zeros(noise.shape))
     inputs = (worker.view, worker.task, worker.task_state, noise)
-    return in_groups(decide, needed, inputs, outputs, agent.config.group)
+    choice, ahead, *how = in_groups(decide, needed, inputs, outputs, agent.config.group)
+    return choice, ahead, Decision(needed, *how)
 
 
 def decide(agent: Agent, params: Params, book: TaskBook, worker: Worker, noise: jax.Array) -> tuple[Worker, Decision]:
     """Assigns a sub-task wherever one is due."""
-    choice, ahead, log_prob, value = plan_where(agent, params, book, worker, worker.awaiting, noise)
-    decision = Decision(made=worker.awaiting, log_prob=log_prob, value=value)
+    choice, ahead, decision = plan_where(agent, params, book, worker, worker.awaiting, noise)
     awaiting = jnp.zeros_like(worker.awaiting)
     return dataclasses.replace(worker, assigned=choice, ahead=ahead, awaiting=awaiting), decision
 

@@ -9,6 +9,7 @@ nodes, **P** atomic propositions.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import jax
@@ -185,15 +186,20 @@ def _grow(
     """
     max_path, num_propositions = path_reach.shape
     longest = branch_lengths(max_path, max_nodes)
-    keys = jax.random.split(key, 4)
+    rounds = max(1, *longest)  # One at least, so that there is something to gather nothing from where no branch fits.
+    num_places = int(longest.sum())
+    shapes = ((2, max_path), (rounds, max_path, num_propositions), (num_places, num_propositions + 1))
+    sizes = [math.prod(shape) for shape in shapes]
+    # One draw for everything: each takes longer to compile than what is done with it.
+    drawn = jnp.split(jax.random.uniform(key, (sum(sizes),)), np.cumsum(sizes)[:-1])
+    chance, lottery, noise = (x.reshape(shape) for x, shape in zip(drawn, shapes, strict=True))
+
     place = np.arange(max_path)
-    grows = jax.random.bernoulli(keys[0], branch, (max_path,)) & (place < length)
+    grows = (chance[0] < branch) & (place < length)
     limit = jnp.minimum(length - place, longest)
-    wanted = jnp.floor(jax.random.uniform(keys[1], (max_path,)) * limit).astype(jnp.int32) + 1
+    wanted = jnp.floor(chance[1] * limit).astype(jnp.int32) + 1
     wanted = jnp.where(grows, jnp.minimum(wanted, limit), 0)
 
-    rounds = max(1, *longest)  # One at least, so that there is something to gather nothing from where no branch fits.
-    lottery = jax.random.uniform(keys[2], (rounds, max_path, num_propositions))
     before = jnp.concatenate([jnp.zeros((1, num_propositions), bool), path_reach[:-1]])
     excluded, exists = seen | before | path_reach, jnp.ones(max_path, bool)
     reach, alive, forbidden = [], [], []
@@ -210,7 +216,6 @@ def _grow(
     offset = np.concatenate([np.arange(n) for n in longest])
     goal, exists, taboo = (jnp.stack(x)[offset, owner] for x in (reach, alive, forbidden))
     ends = exists & ~jnp.append(exists & (offset > 0), False)[1:]
-    noise = jax.random.uniform(keys[3], (len(owner), num_propositions + 1))
     avoid = jax.vmap(lambda n, f: _random_avoid(n, f, max_avoid))(noise, taboo) & exists[:, None]
 
     first = max_path + 1 + np.concatenate([[0], np.cumsum(longest)])[owner]

@@ -34,6 +34,7 @@ class Trajectory:
     decided: jax.Array  # bool, the planner decided before
     plan_log_prob: jax.Array  # float32, where decided
     plan_value: jax.Array  # float32, where decided
+    advice: jax.Array  # float32 [..., N], where decided
     action: jax.Array  # int32, or float32 [..., A]
     log_prob: jax.Array  # float32
     value: jax.Array  # float32
@@ -79,20 +80,20 @@ def fill_pool(key: jax.Array, agent: Agent, book: TaskBook, level: jax.Array, si
     env: Any = agent.env  # to draw contested layouts is no duty of environments
     selective = config.contested > 0 and hasattr(env, "contested_layout")
 
-    def draw(key: jax.Array, task: jax.Array) -> Any:
+    def draw(key: jax.Array, task: jax.Array, wanted: jax.Array) -> Any:
         if not selective:
             return env.sample_layout(key, env.default_params)
-        coin, key = jax.random.split(key)
-        wanted = jax.random.bernoulli(coin, config.contested)
         first, second = opening(jax.tree.map(lambda x: x[task], book.tree))
         return env.contested_layout(key, first & wanted, second & wanted, env.default_params)
 
     def one(index: jax.Array) -> Pool:
-        keys = jax.random.split(jax.random.fold_in(key, index), 3)
-        levels = curriculum.draw_levels(keys[0], level, config.earlier, size)
-        rows = jax.random.randint(keys[1], (size,), 0, config.tasks_per_level)
-        tasks = (agent.config.num_envs + levels * config.tasks_per_level + rows).astype(jnp.int32)
-        return Pool(layout=jax.vmap(draw)(jax.random.split(keys[2], size), tasks), task=tasks, level=levels)
+        keys = jax.random.split(jax.random.fold_in(key, index), size + 1)
+        chance = jax.random.uniform(keys[size], (4, size))
+        levels = curriculum.draw_levels(chance[:2], level, config.earlier)
+        rows = (chance[2] * config.tasks_per_level).astype(jnp.int32)
+        tasks = agent.config.num_envs + levels * config.tasks_per_level + rows
+        layouts = jax.vmap(draw)(keys[:size], tasks, chance[3] < config.contested)
+        return Pool(layout=layouts, task=tasks, level=levels)
 
     return jax.vmap(one)(jnp.arange(agent.config.num_envs))
 
@@ -156,10 +157,10 @@ def collect(
         both = jax.tree.map(lambda *x: jnp.concatenate(x), after, worker)
         needed = jnp.concatenate([after.awaiting | last, outcome.truncated])
         plan_noise = jnp.concatenate([plan_noise, jnp.zeros_like(plan_noise)])
-        choice, ahead, plan_log_prob, plan_value = plan_where(agent, params, book, both, needed, plan_noise)
+        choice, ahead, planned = plan_where(agent, params, book, both, needed, plan_noise)
         choice = jnp.where(after.awaiting, choice[:num_envs], after.assigned)
         ahead = jnp.where(after.awaiting[:, None, None], ahead[:num_envs], after.ahead)
-        bootstrap = jnp.where(outcome.truncated, plan_value[num_envs:], plan_value[:num_envs])
+        bootstrap = jnp.where(outcome.truncated, planned.value[num_envs:], planned.value[:num_envs])
         record = Trajectory(
             view=before.view,
             task=before.task,
@@ -171,6 +172,7 @@ def collect(
             decided=decision.made,
             plan_log_prob=decision.log_prob,
             plan_value=decision.value,
+            advice=decision.advice,
             action=action,
             log_prob=log_prob,
             value=value,
@@ -189,7 +191,7 @@ def collect(
         )
         collector = Collector(
             worker=dataclasses.replace(after, assigned=choice, ahead=ahead, awaiting=jnp.zeros(num_envs, bool)),
-            decision=Decision(after.awaiting, plan_log_prob[:num_envs], plan_value[:num_envs]),
+            decision=dataclasses.replace(jax.tree.map(lambda x: x[:num_envs], planned), made=after.awaiting),
             level=jnp.where(ended, fresh.level, collector.level),
             started=started,
         )

@@ -70,7 +70,7 @@ def planner_targets(
     bootstrap: jax.Array,
     *,
     discount: float,
-    gae_lambda: float,
+    gae_lambda: float | jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """SMDP generalised advantages of the planner's decisions.
 
@@ -84,7 +84,7 @@ def planner_targets(
         value: float32 ``[T, E]``, V^h at t; read where ``decided``.
         bootstrap: float32 ``[T, E]``, V^h of the state after t; read where truncated and at T - 1.
         discount: γ.
-        gae_lambda: λ per decision.
+        gae_lambda: λ per decision, one for all or float32 ``[T, E]``.
 
     Returns:
         Advantages and returns (``advantage + value``), float32 ``[T, E]``; meaningful where ``decided``.
@@ -95,7 +95,7 @@ def planner_targets(
         carry: tuple[jax.Array, jax.Array], inputs: tuple[jax.Array, ...]
     ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
         ahead, advantage_ahead = carry
-        reward, terminated, cut, decided, value, bootstrap = inputs
+        reward, terminated, cut, decided, value, bootstrap, gae_lambda = inputs
         ahead = jnp.where(cut, bootstrap, ahead)
         advantage_ahead = jnp.where(cut | terminated, 0.0, advantage_ahead)
         gain = reward + discount * jnp.where(terminated, 0.0, ahead)
@@ -106,6 +106,6 @@ def planner_targets(
         return (ahead, advantage_ahead), advantage
 
     zero = jnp.zeros_like(reward[0])
-    inputs = (reward, terminated, cut, decided, value, bootstrap)
+    inputs = (reward, terminated, cut, decided, value, bootstrap, jnp.broadcast_to(gae_lambda, reward.shape))
     advantage = jax.lax.scan(backward, (zero, zero), inputs, reverse=True)[1]
     return advantage, advantage + value

@@ -89,7 +89,9 @@ class Trainer:
             worker, assigned=jnp.ones(config.num_envs, jnp.int32), awaiting=jnp.zeros(config.num_envs, bool)
         )
         zeros = jnp.zeros(config.num_envs, jnp.int32)
-        decision = Decision(made=zeros > 0, log_prob=jnp.zeros(config.num_envs), value=jnp.zeros(config.num_envs))
+        nothing = jnp.zeros(config.num_envs)
+        advice = jnp.zeros((config.num_envs, config.curriculum.max_nodes))
+        decision = Decision(made=zeros > 0, log_prob=nothing, value=nothing, advice=advice)
         transforms = self._transforms()
         return TrainState(
             params=params,
@@ -178,8 +180,6 @@ class Trainer:
             )
             metrics.update({f"{name}/{k}": v for k, v in result.items()})
 
-        if config.network.advice:
-            plan = dataclasses.replace(plan, advice=_advice(agent, state.params, plan))
         train("controller", keys[0], low, config.low, controller_loss)
         train("planner", keys[1], plan, config.high, planner_loss)
         if config.shield.mode != "off":
@@ -284,12 +284,6 @@ def reach_loss(
     values = jax.vmap(agent.reach_values_of, in_axes=(None, 0, 0))({"reach_critic": params}, view, action)
     loss = ((values - target) ** 2).mean()
     return loss, {"value_loss": loss}
-
-
-def _advice(agent: Agent, params: Params, batch: PlanBatch) -> jax.Array:
-    """The low level's advice on each decision, ``[B, N]``, at the start of the update."""
-    told = jax.vmap(agent.instruct, in_axes=(None, 0))(params, batch.tree)
-    return agent.advise(params, batch.view, batch.tree, plan_state(batch), told)[0]
 
 
 def _fit(

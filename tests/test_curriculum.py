@@ -48,7 +48,9 @@ def test_types_never_change() -> None:
 
 @pytest.mark.parametrize("level", [0, 1, 3])
 def test_a_share_of_earlier_levels(level: int) -> None:
-    drawn = np.asarray(curriculum.draw_levels(jax.random.key(level), jnp.int32(level), 0.2, 4000))
+    drawn = np.asarray(
+        curriculum.draw_levels(jax.random.uniform(jax.random.key(level), (2, 4000)), jnp.int32(level), 0.2)
+    )
     assert drawn.max() == level
     assert drawn.min() == 0
     assert (drawn < level).mean() == pytest.approx(0.2 if level else 0, abs=0.03)

@@ -3,16 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import flax.linen as nn
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 
 
 def initializer(gain: float) -> nn.initializers.Initializer:
-    """Weights of a layer that scales its input by ``gain``."""
-    # Normal, not orthogonal: a QR decomposition per layer takes longer to compile than the rest of a run's start.
-    return nn.initializers.variance_scaling(gain**2, "fan_in", "truncated_normal")
+    """Standard deviations of the weights of a layer that scales its input by ``gain``; see :func:`randomised`."""
+
+    def deviation(key: Any, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
+        del key
+        return jnp.full(shape, gain / shape[0] ** 0.5, dtype)
+
+    return deviation
+
+
+def randomised(key: jax.Array, deviations: Any) -> Any:
+    """Truncated normal weights with the given standard deviations, a pytree; zeros stay zeros. The key is consumed.
+
+    One draw serves all layers: with one for each, compiling this would take longer than the rest of a run's start.
+    """
+    flat, restore = jax.flatten_util.ravel_pytree(deviations)
+    within = 2.0  # standard deviations; what remains of a standard normal there has the deviation divided by
+    drawn = flat * jax.random.truncated_normal(key, -within, within, flat.shape) / 0.87962566
+    return restore(jax.lax.optimization_barrier(drawn))  # or each layer's slice would draw all of them anew
 
 
 class MLP(nn.Module):

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from hrlspec.config import NetworkConfig
-from hrlspec.networks.encoder import MLP, Encoder
+from hrlspec.networks.encoder import MLP, Encoder, initializer
 from hrlspec.networks.tree import sum_to_parents, sweep_up
 from hrlspec.spec import TaskState, TaskTree, open_edges, subtask_avoid
 
@@ -28,7 +28,7 @@ class Planner(nn.Module):
         features = c.planner_features
         self.encoder = Encoder(c.latent, c.conv_channels, c.encoder_mlp)
         self.transition = MLP((c.planner_hidden, c.planner_hidden, c.latent), final_scale=0.1)
-        self.project = nn.Dense(features)
+        self.project = nn.Dense(features, kernel_init=initializer(1.0))
         self.message = MLP((features, features))
         self.update = MLP((features, features))
         self.policy = MLP((*c.planner_policy, 1), final_scale=0.01)

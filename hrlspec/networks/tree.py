@@ -12,6 +12,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from hrlspec.networks.encoder import initializer
 from hrlspec.spec import TaskTree
 
 
@@ -85,9 +86,9 @@ class TaskEmbedding(nn.Module):
 
     def setup(self) -> None:
         """Declares the weights: of a node's own features, and of the message along an edge."""
-        self.own = nn.Dense(self.features)
-        self.message = nn.Dense(self.features, use_bias=False)
-        self.edge = nn.Dense(self.features, use_bias=False)
+        self.own = nn.Dense(self.features, kernel_init=initializer(1.0))
+        self.message = nn.Dense(self.features, use_bias=False, kernel_init=initializer(1.0))
+        self.edge = nn.Dense(self.features, use_bias=False, kernel_init=initializer(1.0))
 
     def __call__(self, tree: TaskTree) -> jax.Array:
         """Embeds all progressions of one task, float32 ``[N, F]``."""

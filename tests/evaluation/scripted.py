@@ -43,13 +43,13 @@ class Walker(Agent):
 
     def plan_ahead(
         self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """By index."""
         del view
         num_envs, num_nodes = tree.parent.shape
         index = jnp.arange(num_nodes)
         wish = jnp.where(params["last"], index, -index).astype(jnp.float32)
-        return jnp.where(jax.vmap(open_edges)(tree, state), wish, -FAR), jnp.zeros(num_envs), told.ahead
+        return jnp.where(jax.vmap(open_edges)(tree, state), wish, -FAR), jnp.zeros(num_envs), wish, told.ahead
 
     def control(self, params: Params, view: View, told: Instruction) -> tuple[jax.Array, jax.Array]:
         """Minus the steps that remain after each action."""

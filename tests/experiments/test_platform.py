@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from experiments.platform import with_code_level, with_loop_option
+from experiments.platform import compiled_quickly, with_loop_option
 
 ROOT = Path(__file__).parents[2]
 OPTION = "xla_cpu_small_while_loop_byte_threshold=65536"
@@ -37,9 +37,11 @@ def test_the_option_for_loops(flags: str, version: tuple[int, ...], expected: st
 
 
 def test_the_level_of_optimisation_is_the_users_to_choose() -> None:
-    assert with_code_level("--xla_a=1") == "--xla_a=1 --xla_backend_optimization_level=1"
-    for flags in ("--xla_backend_optimization_level=3 --xla_a=1", with_code_level("")):
-        assert with_code_level(flags) == flags
+    ours = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
+    assert compiled_quickly("--xla_a=1") == f"--xla_a=1 {ours}"
+    assert compiled_quickly(ours) == ours
+    mine = "--xla_cpu_use_fusion_emitters=true --xla_backend_optimization_level=3 --xla_a=1"
+    assert compiled_quickly(mine) == mine
 
 
 SCRIPT = """
@@ -77,7 +79,7 @@ def test_the_cache_belongs_to_user_and_version(tmp_path: Path) -> None:
     folder, least, flags = prepared(XDG_CACHE_HOME=str(tmp_path), JAX_PLATFORMS="cpu")
     assert folder == f"{tmp_path}/hrlspec/jaxlib-{jaxlib.version.__version__}"
     assert float(least) == 0.2
-    assert flags == with_code_level(with_loop_option("", jax.__version_info__))
+    assert flags == compiled_quickly(with_loop_option("", jax.__version_info__))
 
 
 def test_physics_is_optimised_in_full() -> None:

@@ -1,0 +1,132 @@
+"""Compiled programs kept from one process to the next, so that a start needs neither tracing nor compiling.
+
+JAX's own cache keeps what XLA compiled, but has to trace a program to look it up; that takes longer than all the rest
+of a start. Here a program is found by what it was made from: the sources of the packages, versions, settings, shapes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import importlib.metadata
+import os
+import pickle
+import platform
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax.experimental import serialize_executable
+
+import envs_jax
+import hrlspec
+
+KEPT = 64
+"""Programs in the folder; those used least recently go first."""
+
+
+class Program:
+    """A jitted function of fixed static arguments, for one set of shapes: loaded or compiled at the first call.
+
+    Args:
+        name: of the file.
+        function: jitted, with its static arguments first.
+        static: these; their ``repr`` must tell everything about them.
+    """
+
+    def __init__(self, name: str, function: Any, *static: Any) -> None:
+        self._name, self._function, self._static = name, function, static
+        self._compiled: Callable[..., Any] | None = None
+
+    def __call__(self, *args: Any) -> Any:
+        """Runs it; the arguments have the same shapes and types at each call."""
+        if self._compiled is None:
+            self._compiled = self._find(args)
+        return self._compiled(*args)
+
+    def _find(self, args: tuple[Any, ...]) -> Callable[..., Any]:
+        folder = _folder()
+        if folder is None:
+            return self._compile(args)
+        file = folder / f"{self._name}-{_digest(_fingerprint(), self._static, _described(args))}"
+        with contextlib.suppress(Exception):  # not there, or damaged, or of another machine: it is made anew
+            return _load(file, args)
+        compiled = self._compile(args)
+        with contextlib.suppress(Exception):  # no space, or a backend that cannot: the next start compiles again
+            _save(file, compiled)
+        return compiled
+
+    def _compile(self, args: tuple[Any, ...]) -> jax.stages.Compiled:
+        compiled: jax.stages.Compiled = self._function.lower(*self._static, *args).compile()
+        return compiled
+
+
+def _folder() -> Path | None:
+    """Next to JAX's own cache, and only where that is used."""
+    settings = jax.config.values
+    folder = settings["jax_compilation_cache_dir"] if settings["jax_enable_compilation_cache"] else None
+    return Path(folder) / "hrlspec-programs" if folder else None
+
+
+def _load(file: Path, args: tuple[Any, ...]) -> Callable[..., Any]:
+    payload, result = pickle.loads(file.read_bytes())
+    os.utime(file)
+    in_tree = jax.tree.structure((args, {}))
+    program: Any = serialize_executable.deserialize_and_load(payload, in_tree, jax.tree.structure(result))
+    return program
+
+
+def _save(file: Path, compiled: jax.stages.Compiled) -> None:
+    payload, _, out_tree = serialize_executable.serialize(compiled)
+    # Structures of trees cannot be stored, but trees can.
+    content = pickle.dumps((payload, jax.tree.unflatten(out_tree, range(out_tree.num_leaves))))
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=file.parent, prefix=".", delete=False) as temporary:
+        temporary.write(content)
+    os.replace(temporary.name, file)
+    known = sorted(file.parent.glob("[!.]*"), key=lambda path: path.stat().st_mtime, reverse=True)
+    for old in known[KEPT:]:
+        old.unlink(missing_ok=True)
+
+
+def _digest(*parts: Any) -> str:
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
+
+
+def _described(args: tuple[Any, ...]) -> tuple[str, ...]:
+    """Structure, shapes and types of arguments."""
+    leaves, structure = jax.tree.flatten(args)
+    return (str(structure), *(str(jax.typeof(leaf)) for leaf in leaves))
+
+
+@functools.cache
+def _fingerprint() -> tuple[Any, ...]:
+    """What decides, besides settings and shapes, which machine code comes out."""
+    sources = hashlib.sha256()
+    for package in (hrlspec, envs_jax):
+        for file in sorted(Path(str(package.__file__)).parent.rglob("*.py")):
+            sources.update(file.read_bytes())
+    versions = sorted(
+        (str(name), found.version) for found in importlib.metadata.distributions() if (name := found.metadata["Name"])
+    )
+    settings = sorted((name, repr(value)) for name, value in jax.config.values.items() if "cache" not in name)
+    device = jax.devices()[0]
+    return (
+        sources.hexdigest(),
+        versions,
+        settings,
+        os.environ.get("XLA_FLAGS"),
+        platform.python_version(),
+        (device.platform, device.device_kind, jax.device_count(), _processor()),
+    )
+
+
+def _processor() -> str:
+    """What instructions the machine knows, as far as the system says so."""
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next((line for line in lines if line.startswith("flags")), "")
+    return platform.processor()
