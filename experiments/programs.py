@@ -14,12 +14,13 @@ import os
 import pickle
 import platform
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
 from jax.experimental import serialize_executable
+from jax.experimental.compilation_cache import compilation_cache
 
 import envs_jax
 import hrlspec
@@ -60,8 +61,27 @@ class Program:
         return compiled
 
     def _compile(self, args: tuple[Any, ...]) -> jax.stages.Compiled:
-        compiled: jax.stages.Compiled = self._function.lower(*self._static, *args).compile()
+        lowered = self._function.lower(*self._static, *args)
+        # What comes out of JAX's cache lacks code that storing it again would need; the loss shows at the first call.
+        with _without_cache():
+            compiled: jax.stages.Compiled = lowered.compile()
         return compiled
+
+
+@contextlib.contextmanager
+def _without_cache() -> Iterator[None]:
+    """Compiling anew in spite of JAX's cache."""
+    used = jax.config.values["jax_enable_compilation_cache"]
+    _use_cache(False)
+    try:
+        yield
+    finally:
+        _use_cache(used)
+
+
+def _use_cache(enabled: bool) -> None:
+    jax.config.update("jax_enable_compilation_cache", enabled)
+    compilation_cache.reset_cache()  # it reads its settings once
 
 
 def _folder() -> Path | None:

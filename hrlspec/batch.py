@@ -213,16 +213,16 @@ def _copies(
         tree, told = jax.tree.map(lambda x: x[row], (fresh.tree, fresh.told))
         state = dataclasses.replace(jax.vmap(initial)(tree), node=node)
         if not asked:
-            unknown = jnp.zeros(row.shape)
-            return unknown, unknown, agent.advise(params, view, tree, state, told)[0]
+            advice, _ = agent.advise(params, view, tree, state, told)
+            return jnp.zeros(row.shape), jnp.zeros(row.shape), advice
         logits, value, advice, _ = agent.plan_ahead(params, view, tree, state, told)
         return jax.vmap(Categorical(logits.shape[-1]).log_prob)(logits, edge), value, advice
 
     decided = new.decided.reshape(-1)
     nothing = jnp.zeros(decided.shape)
     inputs = (view, row, new.node.reshape(-1), edge)
-    outputs = nothing, nothing, jnp.zeros((*decided.shape, num_nodes))
-    plan_log_prob, plan_value, advice = in_groups(plan, decided, inputs, outputs, group=128)
+    unknown = nothing, nothing, jnp.zeros((*decided.shape, num_nodes))
+    plan_log_prob, plan_value, advice = in_groups(plan, decided, inputs, unknown, group=128)
 
     def shaped(x: jax.Array) -> jax.Array:
         return x.reshape((copies, num_steps, *x.shape[1:]))

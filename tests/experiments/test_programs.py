@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 from experiments import programs
 from experiments.programs import Program
@@ -26,7 +27,7 @@ def scaled(factor: int, x: dict[str, jax.Array], key: jax.Array) -> dict[str, ja
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path) -> Iterator[Path]:
     """The place where programs are kept, empty; nothing is traced yet."""
-    before = jax.config.jax_compilation_cache_dir
+    before = jax.config.values["jax_compilation_cache_dir"]
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     jax.clear_caches()
     traced.clear()
@@ -95,3 +96,17 @@ def test_calls_after_the_first_do_not_look_for_it(folder: Path) -> None:
         file.unlink()
     program(*arguments)
     assert traced == [3]
+
+
+def test_what_the_cache_of_jax_holds_is_compiled_anew(folder: Path) -> None:
+    """An executable that JAX took from its own cache lacks its machine code when it is stored again."""
+    least = jax.config.values["jax_persistent_cache_min_compile_time_secs"]
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    compilation_cache.reset_cache()
+    try:
+        scaled(3, {"x": jnp.ones(4)}, jax.random.key(0))
+        assert any(file.name.startswith("jit_scaled") for file in folder.parent.iterdir())
+        assert (run(), run()) == (12, 12)
+    finally:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
+        compilation_cache.reset_cache()
