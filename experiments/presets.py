@@ -106,6 +106,8 @@ def _continuous(config: Config, learning_rate: float) -> Config:
         entropy=0.003,
         final_entropy=0.0,
         entropy_floor=0.0,
+        # A density can grow a thousandfold within an update, and so can the gradient where the advantage is negative.
+        most_ratio=3.0,
     )
     return dataclasses.replace(
         config,

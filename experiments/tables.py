@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 
 from rich import box
@@ -39,6 +40,8 @@ def suite_table(result: SuiteResult) -> Table:
     ]
     if result.excluded:
         remarks.append(f"{result.excluded} cases that nothing can satisfy in time were left out")
+    if total.optimal_steps_mean:
+        remarks.append(f"steps over optimum: {total.steps_mean.estimate / total.optimal_steps_mean:.3f}")
     if total.myopic_spl is not None:
         remarks.append(f"nearest goal first: success {total.myopic_success_rate:.3f}, SPL {total.myopic_spl:.3f}")
     table = _table(
@@ -105,5 +108,5 @@ def _cell(interval: Interval | None) -> str:
     estimate = f"{interval.estimate:.{1 if large else 3}f}"
     if math.isnan(interval.low):
         return estimate
-    low, high = (f"{bound:.1f}" if large else f"{bound:.2f}".removeprefix("0") for bound in interval[1:])
+    low, high = (f"{bound:.1f}" if large else re.sub(r"^(-?)0\.", r"\1.", f"{bound:.2f}") for bound in interval[1:])
     return f"{estimate} [{low},{high}]"

@@ -15,7 +15,10 @@ import numpy as np
 
 from envs_jax import Box, Discrete
 
-LEAST_LOG_STD, MOST_LOG_STD = -4.0, 1.0
+LEAST_LOG_STD, MOST_LOG_STD = -1.5, 1.0
+MOST_MEAN = 1.5
+"""Bounds of the moments, in units of half the box's width. Experience that is relabelled meets a policy which would
+have acted otherwise: the gradient of its log-likelihood grows with the distance of the means over the variance."""
 
 
 class Distribution(Protocol):
@@ -105,7 +108,7 @@ class DiagonalGaussian:
     """Means and log standard deviations of A components; noise is normal.
 
     An action is a float32 ``[A]`` and may lie outside the box: the environment clips it, and the density is that of
-    what was drawn. So a mean beyond the bound, where noise no longer matters, can be learned.
+    what was drawn. So a mean beyond the bound, where noise matters little, can be learned.
 
     Attributes:
         size: A.
@@ -168,7 +171,7 @@ class DiagonalGaussian:
 
     def _moments(self, outputs: jax.Array) -> tuple[jax.Array, jax.Array]:
         half, middle = (self.high - self.low) / 2, (self.high + self.low) / 2
-        mean, raw = outputs[: self.size], outputs[self.size :]
+        mean, raw = MOST_MEAN * jnp.tanh(outputs[: self.size] / MOST_MEAN), outputs[self.size :]
         return middle + half * mean, jnp.clip(raw, LEAST_LOG_STD, MOST_LOG_STD) + np.log(half)
 
 

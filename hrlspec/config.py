@@ -7,6 +7,7 @@ curriculum level) lives in :class:`hrlspec.training.TrainState`.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Literal
 
 
@@ -66,6 +67,8 @@ class PPOConfig:
     epochs: int = 3
     minibatches: int = 8
     clip: float = 0.2
+    most_ratio: float = math.exp(10.0)
+    """Largest probability ratio that counts where the advantage is negative; 1.0 + ``clip`` or more."""
     entropy: float = 0.002
     final_entropy: float = 0.002
     entropy_floor: float = 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -25,11 +26,17 @@ def normalise(advantage: jax.Array, mask: jax.Array) -> jax.Array:
     return (advantage - mean) / jnp.sqrt(variance + 1e-8)
 
 
-def policy_loss(log_prob: jax.Array, old: jax.Array, advantage: jax.Array, mask: jax.Array, clip: float) -> jax.Array:
-    """Clipped surrogate; ``old`` is the log-probability at the start of the update, under the same task."""
-    # Far outside the clip range only the sign matters; the bound keeps exp from overflowing.
-    ratio = jnp.exp(jnp.clip(jnp.where(mask, log_prob - old, 0.0), -10.0, 10.0))
-    surrogate = jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - clip, 1 + clip) * advantage)
+def policy_loss(
+    log_prob: jax.Array, old: jax.Array, advantage: jax.Array, mask: jax.Array, settings: PPOConfig
+) -> jax.Array:
+    """Clipped surrogate; ``old`` is the log-probability at the start of the update, under the same task.
+
+    Where the advantage is negative the plain surrogate has no bound. With ``most_ratio`` it has (Ye et al., 2020, "dual
+    clip"): what has become so much likelier during the update counts no more.
+    """
+    # Far outside the clip range only the sign matters; the bounds keep exp from overflowing.
+    ratio = jnp.exp(jnp.clip(jnp.where(mask, log_prob - old, 0.0), -10.0, math.log(settings.most_ratio)))
+    surrogate = jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - settings.clip, 1 + settings.clip) * advantage)
     return -masked_mean(surrogate, mask)
 
 

@@ -207,7 +207,7 @@ def controller_loss(
     log_prob = jax.vmap(agent.actions.log_prob)(outputs, flat(batch.action))
     on_policy, valid = flat(batch.on_policy), flat(batch.valid)
     advantage = ppo.normalise(flat(batch.advantage), on_policy)
-    policy = ppo.policy_loss(log_prob, flat(batch.log_prob), advantage, on_policy, settings.clip)
+    policy = ppo.policy_loss(log_prob, flat(batch.log_prob), advantage, on_policy, settings)
     value_loss = ppo.value_loss(value, flat(batch.target), valid, settings.expectile)
     randomness = ppo.masked_mean(jax.vmap(agent.actions.entropy)(outputs), on_policy)
     loss = policy + settings.value_coefficient * value_loss + ppo.entropy_loss(randomness, settings, progress)
@@ -228,7 +228,7 @@ def planner_loss(
     # Where only one edge is open there is nothing to learn, and the mean of the advantages is another one.
     free = batch.chosen & ((logits > MASKED / 2).sum(-1) > 1)
     advantage = ppo.normalise(batch.advantage, free)
-    policy = ppo.policy_loss(log_prob, batch.log_prob, advantage, free, settings.clip)
+    policy = ppo.policy_loss(log_prob, batch.log_prob, advantage, free, settings)
     value_loss = ppo.value_loss(value, batch.target, batch.valid, settings.expectile)
     randomness = ppo.masked_mean(jax.vmap(choices.entropy)(logits), free)
     loss = policy + settings.value_coefficient * value_loss + ppo.entropy_loss(randomness, settings, progress)

@@ -45,7 +45,7 @@ def test_gaussian_density_is_scipys() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
         outputs, action = rng.uniform(-1, 1, size=4), rng.normal(size=2)
-        mean, std = -1 + 2 * outputs[:2], 2 * np.exp(outputs[2:])
+        mean, std = -1 + 2 * 1.5 * np.tanh(outputs[:2] / 1.5), 2 * np.exp(outputs[2:])
         expected = stats.norm.logpdf(action, mean, std).sum()
         assert float(actions.log_prob(jnp.asarray(outputs), jnp.asarray(action))) == pytest.approx(expected, rel=1e-4)
         entropy = stats.norm.entropy(mean, std).sum()

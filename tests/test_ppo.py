@@ -12,6 +12,8 @@ import pytest
 from hrlspec import ppo
 from hrlspec.config import PPOConfig
 
+SETTINGS = PPOConfig(clip=0.2)
+
 
 def test_masked_mean_ignores_the_rest_and_survives_an_empty_mask() -> None:
     x = jnp.array([1.0, 2.0, 100.0])
@@ -37,7 +39,7 @@ def test_policy_loss_equals_a_plain_reading() -> None:
     for i in np.flatnonzero(mask):
         ratio = np.exp(new[i] - old[i])
         total += min(ratio * advantage[i], min(max(ratio, 0.8), 1.2) * advantage[i])
-    assert float(ppo.policy_loss(new, old, advantage, mask, 0.2)) == pytest.approx(-total / mask.sum(), rel=1e-5)
+    assert float(ppo.policy_loss(new, old, advantage, mask, SETTINGS)) == pytest.approx(-total / mask.sum(), rel=1e-5)
 
 
 @pytest.mark.parametrize(("shift", "advantage", "moves"), [(0, 1, 1), (1, 1, 0), (-1, 1, 1), (1, -1, 1), (-1, -1, 0)])
@@ -46,16 +48,27 @@ def test_policy_gradient_stops_where_the_step_is_long_enough(shift: float, advan
     mask = jnp.array([True, False])
 
     def loss(x: jax.Array) -> jax.Array:
-        return ppo.policy_loss(jnp.stack([x, x]), jnp.zeros(2), jnp.full(2, float(advantage)), mask, 0.2)
+        return ppo.policy_loss(jnp.stack([x, x]), jnp.zeros(2), jnp.full(2, float(advantage)), mask, SETTINGS)
 
     gradient = float(jax.grad(loss)(jnp.float32(shift)))
     assert np.sign(gradient) == -np.sign(advantage) * moves
 
 
+@pytest.mark.parametrize(("shift", "advantage", "moves"), [(2, -1, 0), (1, -1, 1), (-2, 1, 1), (2, 1, 0)])
+def test_what_became_much_likelier_counts_no_more(shift: float, advantage: float, moves: int) -> None:
+    """At most e^1.5 times as likely: beyond, a negative advantage has no gradient either."""
+    settings = PPOConfig(most_ratio=float(np.exp(1.5)))
+
+    def loss(x: jax.Array) -> jax.Array:
+        return ppo.policy_loss(x[None], jnp.zeros(1), jnp.full(1, float(advantage)), jnp.ones(1, bool), settings)
+
+    assert np.sign(float(jax.grad(loss)(jnp.float32(shift)))) == -np.sign(advantage) * moves
+
+
 def test_masked_samples_with_senseless_log_probabilities_do_no_harm() -> None:
     def loss(x: jax.Array) -> jax.Array:
         return ppo.policy_loss(
-            jnp.stack([x, x - 1e9]), jnp.array([0.0, 500.0]), jnp.ones(2), jnp.array([True, False]), 0.2
+            jnp.stack([x, x - 1e9]), jnp.array([0.0, 500.0]), jnp.ones(2), jnp.array([True, False]), SETTINGS
         )
 
     value, gradient = jax.value_and_grad(loss)(jnp.float32(0.0))

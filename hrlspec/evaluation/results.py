@@ -15,6 +15,8 @@ from hrlspec.stats import Interval
 ESTIMATES = ("success_rate", "violation_rate", "return_mean", "steps_mean", "spl")
 """The estimates of a :class:`Score`; each has ``<name>_interval`` beside it in JSON."""
 
+_YARDSTICKS = ("optimal_steps_mean", "myopic_success_rate", "myopic_spl")
+
 
 @dataclasses.dataclass(frozen=True)
 class Score:
@@ -28,6 +30,7 @@ class Score:
         steps_mean: steps of the successful episodes, all NaN when there is none.
         spl: success weighted by path length: the mean of success × L*/max(taken, L*), L* the least number of steps in
             the committed reading. ``None`` where L* is not known.
+        optimal_steps_mean: mean L* of the successful episodes, or ``None`` likewise and where there is none.
         myopic_success_rate: success rate, on the same cases, of the agent that always goes to the nearest goal, or
             ``None`` likewise.
         myopic_spl: SPL of that agent, or ``None`` likewise.
@@ -39,6 +42,7 @@ class Score:
     return_mean: Interval
     steps_mean: Interval
     spl: Interval | None
+    optimal_steps_mean: float | None
     myopic_success_rate: float | None
     myopic_spl: float | None
 
@@ -47,18 +51,17 @@ class Score:
         result: dict[str, Any] = {"episodes": self.episodes}
         for name in ESTIMATES:
             result |= interval_to_json(name, getattr(self, name))
-        return result | {"myopic_success_rate": self.myopic_success_rate, "myopic_spl": self.myopic_spl}
+        return result | {name: getattr(self, name) for name in _YARDSTICKS}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Score:
         """The inverse of :meth:`to_json`."""
-        estimates = {name: interval_from_json(name, data) for name in ESTIMATES}
+        estimates: dict[str, Any] = {name: interval_from_json(name, data) for name in ESTIMATES}
         if data["spl"] is None:
-            estimates["spl"] = None  # type: ignore[assignment]
+            estimates["spl"] = None
         return cls(
             episodes=data["episodes"],
-            myopic_success_rate=data["myopic_success_rate"],
-            myopic_spl=data["myopic_spl"],
+            **{name: data[name] for name in _YARDSTICKS},
             **estimates,
         )
 

@@ -94,11 +94,12 @@ def _score(cases: Cases, episodes: Episodes, where: np.ndarray, horizon: int) ->
     """Of the given cases."""
     task = cases.task[where]
     success, steps = np.asarray(episodes.success)[where], np.asarray(episodes.steps)[where]
-    spl = myopic_success = myopic_spl = None
+    spl = optimal_steps = myopic_success = myopic_spl = None
     if cases.optimum is not None and cases.myopic is not None:
         optimum, myopic = cases.optimum[where], cases.myopic[where]
         arrives = myopic <= horizon
         spl = _clip(_mean(path_ratio(success, steps, optimum), task))
+        optimal_steps = float(optimum[success].mean()) if success.any() else None
         myopic_success, myopic_spl = float(arrives.mean()), float(path_ratio(arrives, myopic, optimum).mean())
     return Score(
         episodes=len(where),
@@ -107,6 +108,7 @@ def _score(cases: Cases, episodes: Episodes, where: np.ndarray, horizon: int) ->
         return_mean=_mean(np.asarray(episodes.returns)[where], task),
         steps_mean=_mean(steps[success], task[success]),
         spl=spl,
+        optimal_steps_mean=optimal_steps,
         myopic_success_rate=myopic_success,
         myopic_spl=myopic_spl,
     )

@@ -54,6 +54,7 @@ def test_totals_by_hand():
     assert total.steps_mean.estimate == 5  # of 2, 8 and 5: the failed episode does not count
     assert total.spl.estimate == pytest.approx((1 + 0.5 + 0 + 1) / 4)
     assert 0 <= total.spl.low <= total.spl.high <= 1
+    assert total.optimal_steps_mean == pytest.approx((2 + 4 + 5) / 3)
     assert total.myopic_success_rate == 0.5  # 80 steps are beyond the horizon
     assert total.myopic_spl == pytest.approx((1 + 0.8) / 4)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 
 import pytest
@@ -23,6 +24,7 @@ def score(success: float, *, spl: bool = True) -> Score:
         return_mean=Interval(success, -0.123, 1.2),
         steps_mean=Interval(12.345, 11.111, 13.9) if success else Interval(NAN, NAN, NAN),
         spl=Interval(0.5, NAN, NAN) if spl else None,
+        optimal_steps_mean=10.0 if spl else None,
         myopic_success_rate=0.9 if spl else None,
         myopic_spl=0.8 if spl else None,
     )
@@ -50,8 +52,13 @@ def test_a_suite() -> None:
     (failed,) = [line.split() for line in found if line.strip().startswith("depth 4")]
     assert failed[5:] == ["[-.12,1.20]", "-", "0.500"]
     text = " ".join(" ".join(found).split())
-    for remark in ("sampled actions", "shield on", "violated: 0.012", "3 cases", "SPL 0.800"):
+    for remark in ("sampled actions", "shield on", "violated: 0.012", "3 cases", "over optimum: 1.23", "SPL 0.800"):
         assert remark in text
+
+
+def test_bounds_lose_their_leading_zero_alone() -> None:
+    total = dataclasses.replace(score(0.5), steps_mean=Interval(9.925, 9.56, 10.29))
+    assert "[9.56,10.29]" in "".join(lines(suite_table(dataclasses.replace(result(), total=total))))
 
 
 def test_without_an_exact_solver_there_is_no_spl() -> None:
