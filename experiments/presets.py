@@ -114,8 +114,11 @@ def _continuous(config: Config, learning_rate: float) -> Config:
         num_steps=128,
         steps_per_slot=16,
         planner_share=64,
+        group=8,
         low=low,
         network=dataclasses.replace(config.network, encoder_mlp=(128, 128), critic=(64, 64)),
+        # What is found by chance is learned as well, or goals found too rarely are forgotten before they are learned.
+        relabel=dataclasses.replace(config.relabel, share=0.5, visits=True),
         # At first some goals are found rarely; waiting for the last of them would waste the others.
         curriculum=dataclasses.replace(config.curriculum, promotion=0.85, window=256),
     )

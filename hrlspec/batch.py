@@ -18,7 +18,7 @@ from flax import struct
 from hrlspec.actions import Categorical
 from hrlspec.agent import Agent, Params, TaskBook, View, in_groups
 from hrlspec.config import Config
-from hrlspec.relabel import Record, Relabelled, relabel
+from hrlspec.relabel import Record, Relabelled, relabel, visits
 from hrlspec.rewards import RewardMachine
 from hrlspec.rollout import Trajectory
 from hrlspec.spec import TaskState, TaskTree, initial
@@ -186,6 +186,8 @@ def _copies(
             branch=config.relabel.branch,
         )
 
+    if config.relabel.visits:
+        record = jax.vmap(visits)(record)
     new = jax.vmap(one)(keys, record)
     copies, num_steps = rollout.episode.shape
     slot = jnp.minimum(rollout.episode, num_slots - 1)
@@ -247,7 +249,7 @@ def _copies(
         truncated=jnp.zeros_like(new.valid),
         bootstrap=jnp.zeros_like(new.reward),
         plan_bootstrap=jnp.zeros_like(new.reward),
-        edge_taken=rollout.edge_taken & new.valid,
+        edge_taken=record.edge_taken & new.valid,
         reached=record.reach,
         on_policy=new.valid & ~rollout.shielded,
         choice=jnp.full_like(new.valid, config.relabel.planner_policy),

@@ -117,6 +117,8 @@ class RelabelConfig:
     planner_policy: bool = True
     """Whether the planner's policy learns from the copies; its value and transition model always do. In a copy the
     branch taken was not chosen by the planner, and always succeeded."""
+    visits: bool = False
+    """Whether every proposition visited counts as a completed sub-task, in hindsight, and not only those assigned."""
     branch: float = 0.7
     """Probability of a random branch at each node of the completed path."""
 

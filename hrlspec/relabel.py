@@ -66,6 +66,29 @@ class Relabelled:
     valid: jax.Array
 
 
+def visits(record: Record) -> Record:
+    """The same rollout with whatever was visited as a completed sub-task, in hindsight (Andrychowicz et al., 2017).
+
+    A sub-task is completed wherever a proposition holds for the first time since the last one was; it keeps its
+    ``ensuring`` part where it was the one completed on purpose. What nobody asked for is learned as well: without it,
+    a region found too rarely is forgotten before it is learned.
+    """
+    first = jnp.concatenate([jnp.ones(1, bool), record.slot[1:] != record.slot[:-1]])
+
+    def step(seen: jax.Array, inputs: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+        labels, taken, reach, avoid, first = inputs
+        seen = seen & ~first
+        new = labels & ~seen
+        intended = taken & (reach & new).any() & ~(avoid & (seen | labels)).any()
+        found = jnp.arange(labels.shape[0]) == jnp.argmax(new)
+        goal = jnp.where(intended, reach, found) & new.any()
+        return jnp.where(new.any(), labels, seen), (new.any(), goal, avoid & intended)
+
+    inputs = (record.labels, record.edge_taken, record.reach, record.avoid, first)
+    taken, reach, avoid = jax.lax.scan(step, jnp.zeros(record.labels.shape[1:], bool), inputs)[1]
+    return Record(slot=record.slot, labels=record.labels, edge_taken=taken, reach=reach, avoid=avoid)
+
+
 def relabel(
     key: jax.Array,
     record: Record,

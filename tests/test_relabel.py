@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hrlspec.relabel import Record, Relabelled, branch_lengths, relabel
+from hrlspec.relabel import Record, Relabelled, branch_lengths, relabel, visits
 from hrlspec.rewards import Bonus, reward_machine
 from hrlspec.spec import SATISFIED, TaskState, TaskTree, advance, initial, sample_trees, task_hashes
 from tests.probes import pairs, quick_jit, read_monitor
@@ -30,11 +30,14 @@ class Setting(NamedTuple):
     max_path: int
     max_nodes: int
     conjunctions: bool
+    visited: bool = False
 
 
 SETTINGS = [
     Setting(max_path=4, max_nodes=16, conjunctions=False),
     Setting(max_path=3, max_nodes=9, conjunctions=True),  # room for some of each branch only
+    Setting(max_path=4, max_nodes=16, conjunctions=False, visited=True),
+    Setting(max_path=3, max_nodes=9, conjunctions=True, visited=True),
 ]
 NOTHING_RESERVED = np.zeros(200, np.uint32)
 
@@ -93,6 +96,8 @@ def relabelled(setting: Setting) -> tuple[Record, Relabelled]:
     rng = np.random.default_rng(setting.max_nodes)
     rollouts = [play(rng, setting.conjunctions) for _ in range(ROLLOUTS)]
     record = Record(**{name: np.stack([r[name] for r in rollouts]) for name in rollouts[0]})
+    if setting.visited:
+        record = jax.tree.map(np.asarray, quick_jit(jax.vmap(visits))(record))
     keys = jax.random.split(jax.random.key(setting.max_nodes), ROLLOUTS)
     new = relabeller(setting)(keys, record, NOTHING_RESERVED, 0.7)
     return record, jax.tree.map(np.asarray, new)
@@ -108,7 +113,7 @@ def slots_of(record: Record) -> list[tuple[int, int, np.ndarray]]:
     return [entry for entry in found if len(entry[2])]
 
 
-@pytest.fixture(params=SETTINGS, ids=["16 nodes", "conjunctions"])
+@pytest.fixture(params=SETTINGS, ids=["16 nodes", "conjunctions", "visits", "visits, conjunctions"])
 def setting(request: pytest.FixtureRequest) -> Setting:
     return request.param
 
@@ -263,6 +268,25 @@ def test_reserved_tasks_are_never_produced() -> None:
             np.testing.assert_array_equal(again.valid[i, steps], new.valid[i, steps])
     assert kept > 20
     assert len(slots) - kept > 20
+
+
+def test_visits_in_hindsight() -> None:
+    """By hand: b by chance, c on purpose while avoiding a, again c (not new), d and e at once, then another episode."""
+    seen = ["", "b", "b", "", "c", "c", "", "c", "de", "e", "a"]
+    labels = np.array([[letter in step for letter in LETTERS] for step in seen])
+    taken = np.arange(len(seen)) == 4
+    reach, avoid = (labels & taken[:, None]), np.zeros_like(labels)
+    avoid[4] = [True, False, False, False, False]
+    slot = np.array([0] * 10 + [1])
+    found = visits(Record(slot=slot, labels=labels, edge_taken=taken, reach=reach, avoid=avoid))
+    goals = ["".join(letter for letter, wanted in zip(LETTERS, row, strict=True) if wanted) for row in found.reach]
+    assert goals == ["", "b", "", "", "c", "", "", "", "d", "", "a"]
+    np.testing.assert_array_equal(found.edge_taken, found.reach.any(-1))
+    np.testing.assert_array_equal(found.avoid, avoid)
+    forbidden = avoid.copy()
+    forbidden[4, 1] = True  # b was met before: as a sub-task of its own it would have been violated
+    again = visits(Record(slot=slot, labels=labels, edge_taken=taken, reach=reach, avoid=forbidden))
+    assert not again.avoid.any()
 
 
 @pytest.mark.parametrize("branch", [0, 1])
