@@ -25,6 +25,7 @@ import numpy as np
 import envs_jax
 from experiments.platform import prepare
 from experiments.presets import preset, rewards_of
+from experiments.programs import Program
 from hrlspec.agent import Agent
 from hrlspec.curriculum import draw_bank
 from hrlspec.rollout import collect, fill_pool
@@ -145,27 +146,31 @@ def _iterate(trainer: Trainer, bank: Any, machine: Any, reserved: Any, state: An
 
 
 def start(name: str, recipe: str) -> dict[str, float]:
-    """Seconds until the training state and the first iteration are there, in this process."""
+    """Seconds that the training state took, and those that the first iteration took, in this process."""
     env, config, machine = envs_jax.make(name), preset(name, recipe, 1, "ours"), rewards_of(name, 1)
     trainer = Trainer(Agent(env, config))
+    init, iterate = (Program(name, getattr(Trainer, name), trainer) for name in ("init", "iterate"))
     bank = draw_bank(np.random.default_rng(0), config.curriculum, env.num_propositions, np.zeros(0, np.uint32))
     bank = jax.tree.map(jnp.asarray, bank)
     before = time.perf_counter()
-    state = jax.block_until_ready(trainer.init(jax.random.key(0), bank, machine))
+    state = jax.block_until_ready(init(jax.random.key(0), bank, machine))
     between = time.perf_counter()
     reserved = jnp.zeros(1, jnp.uint32)
-    jax.block_until_ready(trainer.iterate(state, bank, machine, reserved))
+    jax.block_until_ready(iterate(state, bank, machine, reserved))
     return {"init_s": between - before, "iteration_s": time.perf_counter() - between}
 
 
 def compile_times(script: str, name: str, recipe: str) -> dict[str, dict[str, float]]:
     """The same start in two fresh processes: with an empty compilation cache, then with the one it left."""
+    result = {}
     with tempfile.TemporaryDirectory() as cache:
         command = [sys.executable, "-m", f"benchmarks.{script}", "--env", name, "--recipes", recipe, "--only-start"]
         environ = os.environ | {"JAX_COMPILATION_CACHE_DIR": cache}
-        runs = [subprocess.run(command, env=environ, check=True, capture_output=True, text=True) for _ in range(2)]
-    cold, warm = (json.loads(run.stdout) for run in runs)
-    return {"cold": cold, "warm": warm}
+        for which in ("cold", "warm"):
+            before = time.perf_counter()
+            run = subprocess.run(command, env=environ, check=True, capture_output=True, text=True)
+            result[which] = {**json.loads(run.stdout), "process_s": time.perf_counter() - before}
+    return result
 
 
 def main(script: str, env: str, flags: CommonFlags, measure: Callable[[], Mapping[str, Any]]) -> None:

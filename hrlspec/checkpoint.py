@@ -323,13 +323,14 @@ def _read_arrays(folder: Path) -> dict[str, np.ndarray]:
     """What orbax wrote."""
     import orbax.checkpoint as ocp
 
-    if not (folder / _ARRAYS).exists():  # every leaf is empty or a Python number
+    arrays = (folder / _ARRAYS).absolute()  # of others orbax finds no metadata
+    if not arrays.exists():  # every leaf is empty or a Python number
         return {}
     try:
         with _silent(), ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as checkpointer:
-            names = checkpointer.metadata(folder / _ARRAYS).item_metadata.tree.keys()
+            names = checkpointer.metadata(arrays).item_metadata.tree.keys()
             as_numpy = {name: ocp.RestoreArgs(restore_type=np.ndarray) for name in names}
-            return checkpointer.restore(folder / _ARRAYS, args=ocp.args.PyTreeRestore(restore_args=as_numpy))
+            return checkpointer.restore(arrays, args=ocp.args.PyTreeRestore(restore_args=as_numpy))
     except Exception as error:  # whatever orbax and its storage raise on content that they cannot read
         raise CheckpointDamagedError(f"checkpoint {folder} is damaged: {' '.join(str(error).split())[:200]}") from error
 

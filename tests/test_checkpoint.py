@@ -94,6 +94,14 @@ def test_a_state_comes_back_bit_by_bit(tmp_path: Path) -> None:
     assert restored.state.rest["python"] == {"count": 2**70, "share": 0.1, "on": True, "off": False}
 
 
+def test_a_relative_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    state = make_state()
+    for folder in (Path("."), Path("runs") / "checkpoints"):
+        save(folder, 1, state)
+        assert state_hash(load(folder, empty_like(state)).state) == state_hash(state)
+
+
 def test_an_abstract_target_and_a_part_of_the_state(tmp_path: Path) -> None:
     state = make_state()
     save(tmp_path, 1, state)
