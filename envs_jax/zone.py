@@ -24,6 +24,8 @@ BOUNDARY = 3.3
 """Where the episode ends, if nothing stops the robot before (m)."""
 MOST_READING = 400.0
 """Bound of any sensor reading; accelerations of a robot that hits a solid wall are the largest."""
+SENSOR_SCALE = np.repeat(np.float32([0.1, 1.0, 0.3, 2.0]), 3)
+"""Brings accelerometer, velocimeter, gyro and magnetometer to about one; gravity is constantly among them."""
 
 
 @struct.dataclass
@@ -208,10 +210,10 @@ class Zone(Environment):
         return jnp.concatenate(parts)
 
     def proposition_view(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Each colour's lidar, float ``[P, L]``, and the other readings as they are, float ``[16]`` or ``[12]``."""
+        """Each colour's lidar, float ``[P, L]``, and the other readings, scaled to about one, float ``[16]`` or ``[12]``."""
         end = NUM_SENSORS + len(COLOURS) * LIDAR_BINS
         lidar = observation[NUM_SENSORS:end].reshape(len(COLOURS), LIDAR_BINS)
-        return lidar, jnp.concatenate([observation[:NUM_SENSORS], observation[end:]])
+        return lidar, jnp.concatenate([observation[:NUM_SENSORS] * SENSOR_SCALE, observation[end:]])
 
     @property
     def _physics_step(self) -> zone_physics.Step:

@@ -128,7 +128,8 @@ def test_observation_has_its_parts_in_place() -> None:
     np.testing.assert_allclose(observation[76:], np.exp([-2.8, -3.8, -3.8, -2.8]), rtol=1e-6)
     lidar, shared = ENV.proposition_view(observation)
     assert lidar[RED, 0] == pytest.approx(np.exp(-0.5))
-    np.testing.assert_array_equal(shared, np.r_[observation[:12], observation[76:]])
+    at_rest = [0, 0, 0.981, 0, 0, 0, 0, 0, 0, 0, -1, 0]
+    np.testing.assert_allclose(shared, np.r_[at_rest, observation[76:]], atol=1e-6)
     solid = PRESETS["zone-ltl2action"]()
     assert solid.observation(state, PARAMS).shape == solid.observation_shape == (76,)
     assert solid.proposition_view(solid.observation(state, PARAMS))[1].shape == (12,)
