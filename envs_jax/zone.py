@@ -210,7 +210,7 @@ class Zone(Environment):
         return jnp.concatenate(parts)
 
     def proposition_view(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Each colour's lidar, float ``[P, L]``, and the other readings, scaled to about one, float ``[16]`` or ``[12]``."""
+        """Each colour's lidar, float ``[P, L]``, and the other readings scaled to about one, ``[16]`` or ``[12]``."""
         end = NUM_SENSORS + len(COLOURS) * LIDAR_BINS
         lidar = observation[NUM_SENSORS:end].reshape(len(COLOURS), LIDAR_BINS)
         return lidar, jnp.concatenate([observation[:NUM_SENSORS] * SENSOR_SCALE, observation[end:]])
