@@ -76,10 +76,8 @@ class Learner:
         self.env: Environment = environment_of(experiment)
         self.agent = Agent(self.env, experiment.config)
         self.trainer = Trainer(self.agent)
-        self._programs = {
-            "init": Program("init", Trainer.init, self.trainer),
-            "iterate": Program("iterate", Trainer.iterate, self.trainer),
-        }
+        self._init_program = Program("init", Trainer.init, self.trainer)
+        self._iterate_program = Program("iterate", Trainer.iterate, self.trainer)
         self.machine: RewardMachine = rewards_of(experiment.env, experiment.reward_set)
         self._reserved = reserved_hashes(experiment.env)
         self._reserved_on_device = jnp.asarray(self._reserved)
@@ -132,13 +130,13 @@ class Learner:
         )
 
     def _init(self) -> TrainState:
-        init = self._programs["init"]
-        state: TrainState = init(jax.random.key(self.experiment.seed), self._bank_of(0), self.machine)
+        key = jax.random.key(self.experiment.seed)
+        state: TrainState = self._init_program(key, self._bank_of(0), self.machine)
         return state
 
     def _iterate(self, state: TrainState, index: int) -> tuple[TrainState, Mapping[str, jax.Array]]:
         bank = self._bank_of(index // BANK_ITERATIONS)
-        result: tuple[TrainState, Mapping[str, jax.Array]] = self._programs["iterate"](
+        result: tuple[TrainState, Mapping[str, jax.Array]] = self._iterate_program(
             state, bank, self.machine, self._reserved_on_device
         )
         return result
