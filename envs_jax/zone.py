@@ -24,7 +24,7 @@ BOUNDARY = 3.3
 """Where the episode ends, if nothing stops the robot before (m)."""
 MOST_READING = 400.0
 """Bound of any sensor reading; accelerations of a robot that hits a solid wall are the largest."""
-SENSOR_SCALE = np.repeat(np.float32([0.1, 1.0, 0.3, 2.0]), 3)
+SENSOR_SCALE = np.repeat(np.array([0.1, 1.0, 0.3, 2.0], np.float32), 3)
 """Brings accelerometer, velocimeter, gyro and magnetometer to about one; gravity is constantly among them."""
 
 

@@ -234,6 +234,7 @@ def _check_level(level: str, settings: PPOConfig) -> None:
     weights = ("clip", "entropy", "final_entropy", "entropy_floor", "final_entropy_floor", "value_coefficient")
     for name in ("learning_rate", "final_learning_rate", *weights):
         _between(0, 1e6, f"{level}.{name}", getattr(settings, name))
+    _between(1 + settings.clip, 1e9, f"{level}.most_ratio", settings.most_ratio)
     _between(1e-9, 1e9, f"{level}.max_grad_norm", settings.max_grad_norm)
 
 

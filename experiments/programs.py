@@ -104,9 +104,10 @@ def _save(file: Path, compiled: jax.stages.Compiled) -> None:
     # Structures of trees cannot be stored, but trees can.
     content = pickle.dumps((payload, jax.tree.unflatten(out_tree, range(out_tree.num_leaves))))
     file.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=file.parent, prefix=".", delete=False) as temporary:
-        temporary.write(content)
-    os.replace(temporary.name, file)
+    with tempfile.TemporaryDirectory(dir=file.parent, prefix=".") as scratch:
+        whole = Path(scratch, file.name)
+        whole.write_bytes(content)
+        whole.replace(file)
     known = sorted(file.parent.glob("[!.]*"), key=lambda path: path.stat().st_mtime, reverse=True)
     for old in known[KEPT:]:
         old.unlink(missing_ok=True)

@@ -55,6 +55,7 @@ BAD_FLAGS = [
     ("--config.high.minibatches 1000000", "--config.high.minibatches is 1000000, expected a divisor of"),
     ("--config.high.learning-rate -1", "--config.high.learning-rate is -1"),
     ("--config.low.learning-rate inf", "--config.low.learning-rate is inf"),
+    ("--config.low.most-ratio 1.1", "--config.low.most-ratio is 1.1, expected a number from 1.2 to"),
     ("--config.network.latent 0", "--config.network.latent is 0"),
     ("--config.network.actor 64 -64", "--config.network.actor"),
     ("--config.num-evns 8", "Unrecognized options: --config.num-evns"),
