@@ -21,6 +21,7 @@ import jax
 import numpy as np
 
 import envs_jax
+from envs_jax.zone_layouts import COLOURS
 from experiments.errors import UserError, main_guard
 from hrlspec.evaluation import Suite, suite_from_text, suite_from_trees
 from hrlspec.spec import TaskTree, sample_sequences, sample_trees, task_hashes
@@ -102,6 +103,19 @@ def _always_avoids(trees: TaskTree) -> np.ndarray:
     return (np.asarray(trees.avoid).any(-1) | ~edge).all(-1)
 
 
+def _ways(trees: TaskTree, first: int, second: int) -> tuple[np.ndarray, np.ndarray]:
+    """How many ways to satisfy each task there are, and how many reach ``second`` after ``first``; int ``[M]``."""
+    parent, reach = np.asarray(trees.parent), np.asarray(trees.reach)
+    rows = np.arange(len(parent))
+    met, spoilt = np.zeros(parent.shape, bool), np.zeros(parent.shape, bool)
+    for node in range(1, parent.shape[1]):  # parents come before children
+        above = parent[:, node]
+        spoilt[:, node] = spoilt[rows, above] | (met[rows, above] & reach[:, node, second])
+        met[:, node] = met[rows, above] | reach[:, node, first]
+    ends = np.asarray(trees.accepting & trees.valid)
+    return ends.sum(-1), (ends & spoilt).sum(-1)
+
+
 _DAG = Recipe(
     "random trees, depth 2, 3 and 4 in equal numbers, 1 to 3 children of a node, 0 to 2 negatives on an edge; "
     "every way to satisfy a task takes 2 sub-tasks or more",
@@ -114,6 +128,29 @@ _ZONE_DAG = Recipe(
     "every way to satisfy a task takes 2 sub-tasks or more",
     tuple(_trees(depth) for depth in (2, 3)),
     lambda trees: _shortest(trees) >= 2,
+)
+_BLUE, _GREEN = (COLOURS.index(colour) for colour in ("blue", "green"))
+
+
+def _possible(trees: TaskTree) -> np.ndarray:
+    """Whether some way to satisfy the task leaves green before blue makes it vanish, bool ``[M]``."""
+    ways, spoilt = _ways(trees, _BLUE, _GREEN)
+    return (_shortest(trees) >= 2) & (spoilt < ways)
+
+
+def _order_matters(trees: TaskTree) -> np.ndarray:
+    """Whether besides that some other way asks for green after blue, bool ``[M]``."""
+    return _possible(trees) & (_ways(trees, _BLUE, _GREEN)[1] > 0)
+
+
+_NM_DAG = dataclasses.replace(
+    _ZONE_DAG, about=f"{_ZONE_DAG.about}, and at least one way asks for no green after blue", keep=_possible
+)
+_NM_ORDER = dataclasses.replace(
+    _ZONE_DAG,
+    about=f"{_NM_DAG.about}, but some other way does, where no green is left",
+    draws=tuple(_trees(depth, num_drawn=16 * NUM_TASKS) for depth in (2, 3)),
+    keep=_order_matters,
 )
 _REACH_AVOID = Recipe(
     "sequences of 2 to 6 sub-tasks in equal numbers, 1 or 2 negatives on each (tasks of one sub-task are too few to "
@@ -166,7 +203,7 @@ RECIPES: dict[str, dict[str, Recipe]] = {
     "flatworld": {"dag": _DAG, "reach_avoid": _REACH_AVOID, "reach": _REACH},
     "zone": {"dag": _ZONE_DAG, "reach_avoid": _REACH_AVOID, "reach": _REACH},
     "zone-ltl2action": {"dag": _ZONE_DAG},
-    "zone-nm": {"dag": _ZONE_DAG},
+    "zone-nm": {"dag": _NM_DAG, "order": _NM_ORDER},
 }
 
 
