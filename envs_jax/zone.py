@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -143,6 +144,12 @@ class Zone(Environment):
         plain = self.resample_layout(key, _no_layout(), ~wanted, params)
         contested = contested_layout(key, jnp.argmax(first), jnp.argmax(second), mirrored=mirrored, needed=wanted)
         return jax.tree.map(lambda this, other: jnp.where(wanted, this, other), contested, plain)
+
+    @property
+    def contested_pairs(self) -> tuple[tuple[int, int], ...]:
+        """Colours to go to first and then that a contested layout can be about: the first leaves the second there."""
+        names = itertools.permutations(COLOURS, 2)
+        return tuple((COLOURS.index(a), COLOURS.index(b)) for a, b in names if (a, b) not in self.vanishing)
 
     def instance_at(self, state: ZoneState, goal: jax.Array) -> jax.Array:
         """Which zone of a colour (``goal``, one-hot bool ``[P]``) the robot is nearest to, int32 ``[]``."""

@@ -9,7 +9,7 @@ Axes: **L** layouts, **S** graph states, **N** tree nodes, **P** atomic proposit
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+import itertools
 from typing import Any, NamedTuple
 
 import jax
@@ -174,8 +174,8 @@ def contested_suite(
     is kept for the reason above alone, so the suite is a random sample of such layouts.
 
     Args:
-        env: an environment with ``transition_table``, or with ``instance_at`` and layouts that are contested by the way
-            they are drawn.
+        env: an environment with ``transition_table``, or with ``instance_at``, ``contested_pairs`` and layouts that are
+            contested by the way they are drawn.
         key: consumed.
         num_cases: Q, an even number.
         margin: see :func:`find_contested`.
@@ -193,7 +193,7 @@ def contested_suite(
         return _drawn_suite(env, key, num_cases, max_nodes, params)
     wanted = num_cases // 2
     kept: dict[bool, list[tuple[Any, ...]]] = {True: [], False: []}
-    pairs = _pairs(env.num_propositions)
+    pairs = itertools.cycle(itertools.permutations(range(env.num_propositions), 2))
     for draw_key in jax.random.split(key, most_rounds):
         layouts = jax.tree.map(np.asarray, _sample_layouts(env, jax.random.split(draw_key, 512), params))
         graph = tabulate(env, layouts, params)
@@ -217,8 +217,8 @@ def contested_suite(
 def _drawn_suite(env: Any, key: jax.Array, num_cases: int, max_nodes: int, params: Any) -> ContestedSuite:
     """Contested layouts and, with the same keys, their mirrored controls; instance 0 is the right one on both."""
     wanted = num_cases // 2
-    pairs = _pairs(env.num_propositions)
-    trees = [two_step_task(*next(pairs), env.num_propositions, max_nodes) for _ in range(wanted)]
+    pairs = itertools.islice(itertools.cycle(env.contested_pairs), wanted)
+    trees = [two_step_task(first, second, env.num_propositions, max_nodes) for first, second in pairs]
     tasks: TaskTree = jax.tree.map(lambda *leaves: np.stack(leaves * 2), *trees)
     contested = np.arange(num_cases) < wanted
     keys = jax.random.split(key, wanted)[np.arange(num_cases) % wanted]
@@ -243,12 +243,3 @@ def _contested_layouts(env: Any, keys: Any, first: Any, second: Any, params: Any
 def _sample_layouts(env: Any, keys: jax.Array, params: Any) -> Any:
     """One layout for each key."""
     return jax.vmap(env.sample_layout, (0, None))(keys, params)
-
-
-def _pairs(num_propositions: int) -> Iterator[tuple[int, int]]:
-    """Ordered pairs of different propositions, round and round."""
-    while True:
-        for first in range(num_propositions):
-            for second in range(num_propositions):
-                if first != second:
-                    yield first, second

@@ -246,6 +246,12 @@ def test_contested_where_two_colours_are_given() -> None:
     assert ((pair[0] - robot) * (drawn.zones[0, 0] - robot)).sum() > 0 > ((pair[1] - robot) * (pair[0] - robot)).sum()
 
 
+def test_contests_are_about_colours_that_stay() -> None:
+    assert set(ENV.contested_pairs) == {(i, j) for i in range(4) for j in range(4) if i != j}
+    blue, green = (ENV.propositions.index(colour) for colour in ("blue", "green"))
+    assert set(ENV.contested_pairs) - set(NM.contested_pairs) == {(blue, green)}
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

@@ -46,6 +46,16 @@ def _paths(edges: dict[int, tuple[int, frozenset[int], frozenset[int]]]) -> list
     return [up(node) for node in edges if node not in {parent for parent, _, _ in edges.values()}]
 
 
+def _asks_for_green_after_blue(edges: dict[int, tuple[int, frozenset[int], frozenset[int]]]) -> list[bool]:
+    """Of the ways from the root to the leaves; colours are numbered in alphabetical order."""
+
+    def colours(node: int) -> list[int]:
+        return [*colours(edges[node][0]), *edges[node][1]] if node else []
+
+    ways = [colours(node) for node in edges if node not in {parent for parent, _, _ in edges.values()}]
+    return [0 in way and 1 in way[way.index(0) :] for way in ways]
+
+
 def _children(edges: dict[int, tuple[int, frozenset[int], frozenset[int]]], node: int) -> int:
     return sum(parent == node for parent, _, _ in edges.values())
 
@@ -74,7 +84,7 @@ def test_rules(env_name, name):
         assert max(paths) == suite.depths[row]
         several += len(paths) > 1
         match name:
-            case "dag":
+            case "dag" | "order":
                 assert min(paths) >= 2
                 assert max(paths) <= 4
                 assert max(_children(edges, node) for node in [0, *edges]) <= 3
@@ -96,9 +106,13 @@ def test_rules(env_name, name):
                 assert len(paths) == 1
             case _:
                 pytest.fail(f"no rules for {name}")
+        if env_name == "zone-nm":
+            spoilt = _asks_for_green_after_blue(edges)
+            assert not all(spoilt)
+            assert any(spoilt) or name != "order"
     assert several >= (0 if name.startswith("reach") else 100)
     depths = dict(zip(*np.unique(suite.depths, return_counts=True), strict=True))
-    if name in ("dag", "wider", "branches"):
+    if name in ("dag", "order", "wider", "branches"):
         assert depths == ({2: 100, 3: 100} if env_name.startswith("zone") else {2: 66, 3: 67, 4: 67})
     if name in ("reach_avoid", "reach"):
         assert depths == dict.fromkeys(range(2, 7) if name == "reach_avoid" else range(4, 13, 2), 40)
