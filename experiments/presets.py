@@ -102,7 +102,6 @@ def _continuous(config: Config, learning_rate: float) -> Config:
     low = dataclasses.replace(
         config.low,
         learning_rate=learning_rate,
-        epochs=3,
         entropy=0.003,
         final_entropy=0.0,
         entropy_floor=0.0,
@@ -112,13 +111,13 @@ def _continuous(config: Config, learning_rate: float) -> Config:
     return dataclasses.replace(
         config,
         num_steps=128,
-        steps_per_slot=16,
+        steps_per_slot=32,
         planner_share=64,
         group=8,
         low=low,
-        network=dataclasses.replace(config.network, encoder_mlp=(128, 128), critic=(64, 64)),
+        network=dataclasses.replace(config.network, encoder_mlp=(64, 64), critic=(64, 64)),
         # What is found by chance is learned as well, or goals found too rarely are forgotten before they are learned.
-        relabel=dataclasses.replace(config.relabel, share=0.5, visits=True),
+        relabel=dataclasses.replace(config.relabel, visits=True),
         # At first some goals are found rarely; waiting for the last of them would waste the others.
         curriculum=dataclasses.replace(config.curriculum, promotion=0.85, window=256),
     )
@@ -144,7 +143,7 @@ def zone(config: Config) -> Config:
         total_steps=10_000_000,
         discount=0.998,
         noise_correlation=0.95,
-        network=dataclasses.replace(config.network, latent=128),
+        network=dataclasses.replace(config.network, encoder_mlp=(128,), latent=128),
         curriculum=dataclasses.replace(config.curriculum, levels=3, max_avoid=2),
     )
 
