@@ -16,7 +16,7 @@ from experiments.errors import UserError
 from experiments.presets import preset
 from hrlspec.config import Config, PPOConfig
 
-Method = Literal["ours", "myopic-low", "no-er"]
+Method = Literal["ours", "ltl2action", "option", "myopic-low", "no-er"]
 Recipe = Literal["paper", "hrlspec"]
 RewardSet = Literal[1, 2]
 
@@ -66,7 +66,8 @@ class RunFlags:
 
     env: Literal["letter", "letter12", "walk", "flatworld", "zone", "zone-ltl2action", "zone-nm"] = "letter"
     method: Method = "ours"
-    """myopic-low: the low level does not see what comes after its sub-task; no-er: no relabelled experience."""
+    """ltl2action: one flat policy sees the whole task; option: value iteration chooses options; myopic-low: the low
+    level does not see what comes after its sub-task; no-er: no relabelled experience."""
     recipe: Recipe = "hrlspec"
     """paper: as the paper describes it; hrlspec: what was measured to be better."""
     reward_set: RewardSet = 1
@@ -221,6 +222,11 @@ def check_config(config: Config) -> None:
         least = 1 if field.name in ("latent", "planner_features", "planner_hidden", "task_features") else 0
         for size in sizes if isinstance(sizes, tuple) else (sizes,):
             _at_least(1 if isinstance(sizes, tuple) else least, f"network.{field.name}", size)
+    if network.whole_task and (network.roles or network.advice or network.task_rounds or config.options):
+        raise UserError(
+            "--config.network.whole-task leaves no sub-task: expected it without network.roles, network.advice, "
+            "network.task-rounds and options"
+        )
     _check_level("low", config.low)
     _check_level("high", config.high)
     _check_minibatches(config)

@@ -26,7 +26,7 @@ def preset(env_name: str, recipe: str, reward_set: int, method: str) -> Config:
         env_name: one of ``envs_jax.registered()``.
         recipe: ``paper``, which is the defaults of :class:`Config`, or ``hrlspec``.
         reward_set: 1 or 2.
-        method: ``ours``, ``myopic-low`` or ``no-er``.
+        method: ``ours``, a baseline (``ltl2action``, ``option``) or an ablation (``myopic-low``, ``no-er``).
     """
     config = Config() if recipe == "paper" else hrlspec()
     config = _WORLDS.get(env_name, lambda config: config)(config)
@@ -39,7 +39,30 @@ def preset(env_name: str, recipe: str, reward_set: int, method: str) -> Config:
         config = dataclasses.replace(config, future_embedding=False)
     if method == "no-er":
         config = dataclasses.replace(config, relabel=dataclasses.replace(config.relabel, share=0.0))
+    if method == "ltl2action":
+        config = ltl2action(config)
+    if method == "option":
+        config = option(config)
     return config
+
+
+def ltl2action(config: Config) -> Config:
+    """One flat policy that is told the whole remaining task; relabelling and curriculum as the paper grants them.
+
+    No sub-task, so no roles to see the world by, no planner, and no proposition that a shield could know to avoid.
+    """
+    network = dataclasses.replace(
+        config.network, whole_task=True, task_rounds=0, roles=False, names=False, symmetric=False, advice=0.0
+    )
+    shield = dataclasses.replace(config.shield, mode="off")
+    return dataclasses.replace(config, network=network, shield=shield, max_operator=False)
+
+
+def option(config: Config) -> Config:
+    """Options know their own sub-goal, and value iteration over what they take chooses them; the shield stays."""
+    network = dataclasses.replace(config.network, lookahead=0, names=False, advice=0.0)
+    # What an option earns is 1 at its goal, whatever the task pays.
+    return dataclasses.replace(config, network=network, options=True, future_embedding=False, max_operator=False)
 
 
 def hrlspec() -> Config:

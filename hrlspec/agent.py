@@ -16,11 +16,12 @@ import jax.numpy as jnp
 from flax import struct
 
 from envs_jax import Environment
+from hrlspec import options
 from hrlspec.actions import Distribution, distribution_over
 from hrlspec.config import Config
 from hrlspec.networks.controller import Controller, Instruction
 from hrlspec.networks.encoder import randomised
-from hrlspec.networks.planner import Planner
+from hrlspec.networks.planner import MASKED, Planner
 from hrlspec.networks.reach_critic import ReachCritic
 from hrlspec.networks.tree import routes
 from hrlspec.spec import TaskState, TaskTree, initial, open_edges
@@ -28,6 +29,8 @@ from hrlspec.spec import TaskState, TaskTree, initial, open_edges
 View = tuple[jax.Array, jax.Array]
 Params = dict[str, Any]
 Estimate = tuple[jax.Array, jax.Array]  # policy outputs and value
+OPTION_SHARPNESS = 100.0
+"""Logits per unit of value between options: a hundredth counts as much as the noise they are sampled with."""
 
 
 @struct.dataclass
@@ -76,7 +79,10 @@ class Agent:
         return ReachCritic(self.config.network.reach_critic, self.actions)
 
     def init(self, key: jax.Array) -> Params:
-        """Fresh parameters: ``planner``, ``controller``, ``reach_critic``. The key is consumed."""
+        """Fresh parameters: ``planner``, ``controller``, ``reach_critic``, and for the baseline Option ``options``.
+
+        The key is consumed.
+        """
         view = self.env.proposition_view(jnp.zeros(self.env.observation_shape))
         tree = _blank_tree(self.env.num_propositions)
         no_advice = jnp.zeros(tree.num_nodes)
@@ -85,7 +91,10 @@ class Agent:
             "controller": self.controller.init(key, view, tree, method="everything"),
             "reach_critic": self.reach_critic.init(key, view),
         }
-        return cast(Params, randomised(key, deviations))
+        params = cast(Params, randomised(key, deviations))
+        if self.config.options:
+            params["options"] = options.unmeasured(self.env.num_propositions)
+        return params
 
     def instruct(self, params: Params, tree: TaskTree) -> Instruction:
         """The instruction for every edge of one task, leading axis N; it says nothing of the future for Myopic-low."""
@@ -98,6 +107,31 @@ class Agent:
         """Prepares tasks (leading axis M) for acting."""
         return TaskBook(tree=trees, told=jax.vmap(self.instruct, in_axes=(None, 0))(params, trees))
 
+    def told_now(
+        self,
+        params: Params,
+        told: Instruction,
+        where: tuple[Any, ...],
+        edge: jax.Array,
+        feasible: jax.Array,
+        ahead: jax.Array,
+    ) -> Instruction:
+        """What the low level is told at single moments.
+
+        Args:
+            params: the networks' parameters.
+            told: the instructions for whole tasks, as a book has them: any leading axes, then N.
+            where: indices of the moments' tasks, one for each leading axis.
+            edge: int32 ``[...]``, the assigned edges.
+            feasible: bool ``[..., N]``, the open ones; read where the whole task is told.
+            ahead: float32 ``[..., D, P]``, what the planner means to reach afterwards.
+        """
+        if not self.config.network.whole_task:
+            return dataclasses.replace(jax.tree.map(lambda x: x[(*where, edge)], told), ahead=ahead)
+        future: Any = self.controller.apply(params["controller"], told.future[where], feasible, method="remaining")
+        nothing = jnp.zeros((*edge.shape, told.reach.shape[-1]))
+        return Instruction(reach=nothing, avoid=nothing, ahead=ahead, future=future)
+
     def plan(self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction) -> Estimate:
         """The planner on one environment: logits over edges ``[N]`` and the value of the remaining task ``[]``."""
         batch = jax.tree.map(lambda x: x[None], (view, tree, state, told))
@@ -107,15 +141,37 @@ class Agent:
     def plan_ahead(
         self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
     ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        """The planner on B environments, and what the low level says and is told.
+        """The planner on B environments, or what stands in its place, and what the low level says and is told.
 
         Returns:
             Logits over edges ``[B, N]``, values ``[B]``, the low level's advice on each edge ``[B, N]``, and what lies
             ahead after it, ``[B, N, D, P]``.
         """
+        if not self.config.plans:
+            return self._stand_in(params, view, tree, state, told)
         advice, ahead = self.advise(params, view, tree, state, told)
         plan: Any = jax.vmap(self.planner.apply, in_axes=(None, 0, 0, 0, 0))
         return (*plan(params["planner"], view, tree, state, advice), advice, ahead)
+
+    def _stand_in(
+        self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """As `plan_ahead` for the baselines: options are chosen by their measurements, a flat policy needs no choice.
+
+        The value is the low level's, of what is chosen.
+        """
+        feasible = jax.vmap(open_edges)(tree, state)
+        if self.config.options:
+            value = jax.vmap(options.values, in_axes=(None, 0, 0))(params["options"], tree, state)
+            best = jnp.where(feasible.any(-1), value.max(-1), 0.0)
+            logits = jnp.where(feasible, OPTION_SHARPNESS * (value - best[:, None]), MASKED)
+        else:
+            logits = jnp.where(jnp.arange(tree.parent.shape[-1]) == TaskTree.ROOT, jnp.zeros(feasible.shape), MASKED)
+        edge = logits.argmax(-1)
+        rows = jnp.arange(edge.shape[0])
+        now = self.told_now(params, told, (rows,), edge, feasible, told.ahead[rows, edge])
+        value = jax.vmap(self.control, in_axes=(None, 0, 0))(params, view, now)[1]
+        return logits, value, jnp.zeros(logits.shape), told.ahead
 
     def advise(
         self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction

@@ -34,6 +34,7 @@ class LowBatch:
     slot: jax.Array  # int32, which of the trees
     edge: jax.Array  # int32, the assigned edge
     ahead: jax.Array  # float32 [..., D, P], what was to be reached after it
+    feasible: jax.Array  # bool [..., N], the open edges; empty unless the low level is told the whole task
     action: jax.Array  # int32, or float32 [..., A]
     log_prob: jax.Array  # float32, at the start of the update, under this task
     advantage: jax.Array  # float32
@@ -99,6 +100,7 @@ class _Experience:
     blocked: jax.Array
     edge: jax.Array
     ahead: jax.Array
+    feasible: jax.Array
     action: jax.Array
     log_prob: jax.Array
     value: jax.Array
@@ -113,6 +115,7 @@ class _Experience:
     plan_bootstrap: jax.Array
     edge_taken: jax.Array
     reached: jax.Array
+    goal: jax.Array
     on_policy: jax.Array
     choice: jax.Array
     valid: jax.Array
@@ -124,6 +127,7 @@ def _originals(config: Config, book: TaskBook, rollout: Trajectory, num_slots: i
     tasks = jnp.zeros((envs.shape[0], num_slots), jnp.int32)
     tasks = tasks.at[envs, rollout.episode].set(rollout.task, mode="drop")
     valid = rollout.episode < num_slots
+    edges = book.tree.valid[rollout.task] & (book.tree.parent[rollout.task] == rollout.node[..., None])
     return _Experience(
         tree=jax.tree.map(lambda x: x[tasks], book.tree),
         view=rollout.view,
@@ -132,6 +136,7 @@ def _originals(config: Config, book: TaskBook, rollout: Trajectory, num_slots: i
         blocked=rollout.blocked,
         edge=rollout.assigned,
         ahead=rollout.ahead,
+        feasible=_kept(config, edges & ~rollout.blocked),
         action=rollout.action,
         log_prob=rollout.log_prob,
         value=rollout.value,
@@ -146,6 +151,7 @@ def _originals(config: Config, book: TaskBook, rollout: Trajectory, num_slots: i
         plan_bootstrap=rollout.plan_bootstrap,
         edge_taken=rollout.edge_taken,
         reached=book.tree.reach[rollout.task, rollout.edge],
+        goal=book.tree.reach[rollout.task, rollout.assigned],
         on_policy=valid & ~rollout.shielded,
         choice=jnp.ones_like(valid),
         valid=valid,
@@ -196,7 +202,9 @@ def _copies(
     row = (jnp.arange(copies)[:, None] * num_slots + slot).reshape(-1)
     edge = new.assigned.reshape(-1)
     view = jax.tree.map(lambda x: x.reshape((copies * num_steps, *x.shape[2:])), rollout.view)
-    told = jax.tree.map(lambda x: x[row, edge], fresh.told)
+    node = new.node.reshape(-1)
+    feasible = fresh.tree.valid[row] & (fresh.tree.parent[row] == node[:, None])
+    told = agent.told_now(params, fresh.told, (row,), edge, feasible, fresh.told.ahead[row, edge])
     if config.network.advice and config.future_embedding:
         # The plan of a relabelled task is the path that was completed; its nodes follow one another.
         later = edge[:, None] + 1 + jnp.arange(told.ahead.shape[1])
@@ -222,7 +230,7 @@ def _copies(
 
     decided = new.decided.reshape(-1)
     nothing = jnp.zeros(decided.shape)
-    inputs = (view, row, new.node.reshape(-1), edge)
+    inputs = (view, row, node, edge)
     unknown = nothing, nothing, jnp.zeros((*decided.shape, num_nodes))
     plan_log_prob, plan_value, advice = in_groups(plan, decided, inputs, unknown, group=128)
 
@@ -237,6 +245,7 @@ def _copies(
         blocked=jnp.zeros((copies, num_steps, num_nodes), bool),
         edge=new.assigned,
         ahead=shaped(told.ahead),
+        feasible=_kept(config, shaped(feasible)),
         action=rollout.action,
         log_prob=shaped(log_prob),
         value=shaped(value),
@@ -251,10 +260,23 @@ def _copies(
         plan_bootstrap=jnp.zeros_like(new.reward),
         edge_taken=record.edge_taken & new.valid,
         reached=record.reach,
+        goal=record.reach,
         on_policy=new.valid & ~rollout.shielded,
         choice=jnp.full_like(new.valid, config.relabel.planner_policy),
         valid=new.valid,
     )
+
+
+def _kept(config: Config, feasible: jax.Array) -> jax.Array:
+    """Open edges ``[..., N]`` where the low level is told of them."""
+    return feasible if config.network.whole_task else feasible[..., :0]
+
+
+def _of_options(x: _Experience) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Reward and ends as options see them: each is over when its sub-task is, and earns 1 if it reached its goal."""
+    reached = x.edge_taken & (x.reached == x.goal).all(-1)
+    over = x.edge_taken | x.terminated | jnp.roll(x.decided, -1, 1).at[:, -1].set(False)
+    return reached.astype(jnp.float32), over, x.truncated
 
 
 def _with_targets(key: jax.Array, config: Config, x: _Experience) -> tuple[LowBatch, PlanBatch]:
@@ -265,7 +287,7 @@ def _with_targets(key: jax.Array, config: Config, x: _Experience) -> tuple[LowBa
 
     ends = in_time(x.reward, x.terminated, x.truncated)
     target = low_level_targets(
-        *ends,
+        *(in_time(*_of_options(x)) if config.options else ends),
         *in_time(x.value, x.bootstrap, x.decided, x.plan_value),
         discount=config.discount,
         gae_lambda=config.low.gae_lambda,
@@ -283,6 +305,7 @@ def _with_targets(key: jax.Array, config: Config, x: _Experience) -> tuple[LowBa
         slot=x.slot,
         edge=x.edge,
         ahead=x.ahead,
+        feasible=x.feasible,
         action=x.action,
         log_prob=x.log_prob,
         advantage=target - x.value,

@@ -49,6 +49,9 @@ class NetworkConfig:
     their world can be turned, seen by role. What is learned in one direction is then known in all."""
     lookahead: int = 2
     """How many later sub-tasks have a role of their own."""
+    whole_task: bool = False
+    """Whether the low level is told the whole remaining task, p₊ and p₋ on its edges, instead of a sub-task: one flat
+    policy and no planner (the baseline LTL2Action). Then ``task_rounds`` is 0, and roles and advice are off."""
     child_embeddings: bool = False
     """Whether the planner's logit of an edge also sees the embedding of the node it leads to."""
     advice: float = 0.0
@@ -153,6 +156,9 @@ class Config:
     """Whether the target at a new sub-task is raised to the planner's value (eq. 6)."""
     future_embedding: bool = True
     """Whether the low level sees what remains after its sub-task; off is the ablation Myopic-low."""
+    options: bool = False
+    """Whether sub-tasks are options that know nothing of each other, chosen by value iteration over what they were
+    measured to take (the baseline Option), instead of by the planner."""
     unfinished: bool = False
     """Whether sub-tasks that were assigned but not completed train the planner."""
     transe: float = 0.01
@@ -176,6 +182,11 @@ class Config:
     curriculum: CurriculumConfig = CurriculumConfig()
     relabel: RelabelConfig = RelabelConfig()
     shield: ShieldConfig = ShieldConfig()
+
+    @property
+    def plans(self) -> bool:
+        """Whether the planner's networks choose the sub-tasks."""
+        return not (self.options or self.network.whole_task)
 
     @property
     def steps_per_iteration(self) -> int:

@@ -18,7 +18,7 @@ from hrlspec.actions import Categorical
 from hrlspec.agent import Agent, Params, TaskBook, View, in_groups, shielded_action
 from hrlspec.networks.controller import Instruction
 from hrlspec.rewards import RewardMachine
-from hrlspec.spec import RUNNING, SATISFIED, TaskState, TaskTree, advance, initial
+from hrlspec.spec import RUNNING, SATISFIED, TaskState, TaskTree, advance, initial, open_edges
 
 
 @struct.dataclass
@@ -145,8 +145,9 @@ def act(
         safe = shielded_action(agent, params, view, told.avoid > 0, action) if shield else action
         return safe, log_prob, value, (safe != action).any()
 
-    told = jax.tree.map(lambda x: x[worker.task, worker.assigned], book.told)
-    return jax.vmap(one)(worker.view, dataclasses.replace(told, ahead=worker.ahead), noise)
+    feasible = jax.vmap(open_edges)(task_of(book, worker.task), worker.task_state)
+    told = agent.told_now(params, book.told, (worker.task,), worker.assigned, feasible, worker.ahead)
+    return jax.vmap(one)(worker.view, told, noise)
 
 
 def transition(

@@ -32,6 +32,7 @@ class Trajectory:
     assigned: jax.Array  # int32, edge pursued
     ahead: jax.Array  # float32 [..., D, P], what the planner meant to reach after it
     decided: jax.Array  # bool, the planner decided before
+    since: jax.Array  # int32, steps since the edge was assigned
     plan_log_prob: jax.Array  # float32, where decided
     plan_value: jax.Array  # float32, where decided
     advice: jax.Array  # float32 [..., N], where decided
@@ -69,6 +70,7 @@ class Collector:
     decision: Decision  # made for the state that the worker is in
     level: jax.Array  # int32 [E], curriculum level of each task
     started: jax.Array  # int32 [E], episodes started so far, for the pool
+    since: jax.Array  # int32 [E], steps since the sub-task in force was assigned
 
 
 def fill_pool(key: jax.Array, agent: Agent, book: TaskBook, level: jax.Array, size: int) -> Pool:
@@ -170,6 +172,7 @@ def collect(
             assigned=before.assigned,
             ahead=before.ahead,
             decided=decision.made,
+            since=collector.since,
             plan_log_prob=decision.log_prob,
             plan_value=decision.value,
             advice=decision.advice,
@@ -194,6 +197,7 @@ def collect(
             decision=dataclasses.replace(jax.tree.map(lambda x: x[:num_envs], planned), made=after.awaiting),
             level=jnp.where(ended, fresh.level, collector.level),
             started=started,
+            since=jnp.where(after.awaiting, 0, collector.since + 1),
         )
         return collector, record
 

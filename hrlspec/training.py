@@ -15,14 +15,15 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from hrlspec import curriculum, ppo
+from hrlspec import curriculum, options, ppo
 from hrlspec.actions import Categorical
-from hrlspec.agent import Agent, Params
+from hrlspec.agent import Agent, Params, TaskBook
 from hrlspec.batch import LowBatch, PlanBatch, build, plan_state
 from hrlspec.config import PPOConfig
 from hrlspec.curriculum import Curriculum
 from hrlspec.interaction import Decision, start
 from hrlspec.networks.planner import MASKED
+from hrlspec.options import Measurements
 from hrlspec.rewards import RewardMachine
 from hrlspec.rollout import Collector, Trajectory, collect, fill_pool
 from hrlspec.spec import TaskTree
@@ -95,8 +96,8 @@ class Trainer:
         transforms = self._transforms()
         return TrainState(
             params=params,
-            optimisers={name: transforms[name].init(params[name]) for name in params},
-            collector=Collector(worker=worker, decision=decision, level=zeros, started=zeros),
+            optimisers={name: transform.init(params[name]) for name, transform in transforms.items()},
+            collector=Collector(worker=worker, decision=decision, level=zeros, started=zeros, since=zeros),
             tasks=tasks,
             curriculum=curriculum.initial(),
             key=key,
@@ -130,6 +131,8 @@ class Trainer:
         collector, trajectory = collect(keys[1], agent, state.params, machine, book, collector, pool)
         low, plan = build(keys[2], agent, state.params, machine, book, trajectory, reserved)
         params, optimisers, losses = self._learn(keys[3], state, low, plan, trajectory)
+        if config.options:
+            params["options"] = measured(params["options"], book, trajectory, config.discount)
         ended = trajectory.terminated | trajectory.truncated
         current = ended & (trajectory.level == state.curriculum.level)
         new_curriculum = curriculum.update(
@@ -181,7 +184,8 @@ class Trainer:
             metrics.update({f"{name}/{k}": v for k, v in result.items()})
 
         train("controller", keys[0], low, config.low, controller_loss)
-        train("planner", keys[1], plan, config.high, planner_loss)
+        if config.plans:
+            train("planner", keys[1], plan, config.high, planner_loss)
         if config.shield.mode != "off":
             settings = PPOConfig(
                 learning_rate=config.shield.learning_rate,
@@ -201,8 +205,8 @@ def controller_loss(
     own = {"controller": params}
     told = jax.vmap(jax.vmap(agent.instruct, in_axes=(None, 0)), in_axes=(None, 0))(own, batch.tree)
     row = jnp.arange(batch.slot.shape[0])[:, None]
-    told = jax.tree.map(lambda x: x[row, batch.slot, batch.edge], told)
-    view, told = jax.tree.map(flat, (batch.view, dataclasses.replace(told, ahead=batch.ahead)))
+    now = agent.told_now(own, told, (row, batch.slot), batch.edge, batch.feasible, batch.ahead)
+    view, told = jax.tree.map(flat, (batch.view, now))
     outputs, value = jax.vmap(agent.control, in_axes=(None, 0, 0))(own, view, told)
     log_prob = jax.vmap(agent.actions.log_prob)(outputs, flat(batch.action))
     on_policy, valid = flat(batch.on_policy), flat(batch.valid)
@@ -263,6 +267,23 @@ def flat(x: jax.Array) -> jax.Array:
 def _distance(x: jax.Array, y: jax.Array) -> jax.Array:
     """Euclidean distance over the last axis, with a finite gradient at zero."""
     return jnp.sqrt(((x - y) ** 2).sum(-1) + 1e-8)
+
+
+def measured(known: Measurements, book: TaskBook, trajectory: Trajectory, discount: float) -> Measurements:
+    """Adds what the options of a rollout took and earned."""
+    x = trajectory
+    following = jnp.roll(x.decided, -1, 0).at[-1].set(False)
+    return options.measure(
+        known,
+        jax.vmap(options.origins)(book.tree)[x.task, x.node],
+        book.tree.reach[x.task, x.assigned],
+        x.edge_taken | x.terminated | x.truncated | following,
+        x.edge_taken & (x.edge == x.assigned),
+        x.satisfied,
+        x.since + 1,
+        x.reward,
+        discount=discount,
+    )
 
 
 def reach_batch(agent: Agent, trajectory: Trajectory) -> tuple[Any, ...]:

@@ -30,7 +30,8 @@ class Instruction:
         reach: float32 ``[P]``, p₊ of the assigned sub-task.
         avoid: float32 ``[P]``, p₋ (eq. 2).
         ahead: float32 ``[D, P]``, what may be reached 1, 2, ... sub-tasks after it.
-        future: float32 ``[F]``, embedding of the task that remains after it.
+        future: float32 ``[F]``, embedding of the task that remains after it, or of the whole remaining task where no
+            sub-task is assigned.
     """
 
     reach: jax.Array
@@ -102,20 +103,28 @@ class Controller(nn.Module):
     def setup(self) -> None:
         """Declares the parts."""
         c = self.config
-        self.task_embedding = TaskEmbedding(c.task_features, c.task_rounds)
+        self.task_embedding = TaskEmbedding(c.task_features, c.task_rounds, negatives=c.whole_task)
         self.encoder = Encoder(c.latent, c.conv_channels, c.encoder_mlp)
         self.actor = MLP((*c.actor, self.num_outputs), final_scale=0.01)
         self.critic = MLP((*c.critic, 1), tanh=True, final_scale=1.0)
 
     def instruct(self, tree: TaskTree) -> Instruction:
-        """The instruction for every edge of a task at once, leading axis N."""
+        """The instruction for every edge of a task at once, leading axis N.
+
+        With ``whole_task`` what is said of the future is meant for `remaining`.
+        """
         depth = self.config.lookahead if self.config.roles else 0
+        embed = self.task_embedding.messages if self.config.whole_task else self.task_embedding
         return Instruction(
             reach=tree.reach.astype(jnp.float32),
             avoid=subtask_avoid(tree).astype(jnp.float32),
             ahead=lookahead(tree, depth).astype(jnp.float32),
-            future=self.task_embedding(tree),
+            future=embed(tree),
         )
+
+    def remaining(self, messages: jax.Array, edges: jax.Array) -> jax.Array:
+        """Embedding of what remains while some edges are open (bool ``[..., N]``), ``[..., F]``."""
+        return self.task_embedding.of_edges(messages, edges)
 
     def __call__(self, view: tuple[jax.Array, jax.Array], told: Instruction) -> tuple[jax.Array, jax.Array]:
         """Acts on one sub-task.

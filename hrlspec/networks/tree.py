@@ -21,7 +21,7 @@ def sum_to_parents(messages: jax.Array, parent: jax.Array, sends: jax.Array) -> 
     return jnp.zeros_like(messages).at[parent].add(jnp.where(sends[:, None], messages, 0.0))
 
 
-def sweep_up(visit: Callable[..., Any], module: nn.Module, carry: Any) -> jax.Array:
+def sweep_up(visit: Callable[..., Any], module: nn.Module, carry: Any) -> Any:
     """Visits the nodes from the last to the root, so that children come before their parents.
 
     The messages of a node are then complete when it is visited: one visit a node does what as many rounds as
@@ -71,7 +71,7 @@ def routes(tree: TaskTree, node: jax.Array, length: int) -> jax.Array:
 
 
 class TaskEmbedding(nn.Module):
-    """GCN over a task tree with zero node features and only p₊ on the edges (paper, "DAG Processing").
+    """GCN over a task tree with zero node features and p₊ on the edges (paper, "DAG Processing").
 
     Information flows from children to parents alone, so one pass embeds every progression at once: row k is
     the embedding of what remains after node k is reached. Weights are shared between rounds.
@@ -79,10 +79,12 @@ class TaskEmbedding(nn.Module):
     Attributes:
         features: F.
         rounds: rounds of message passing, or 0 for one sweep from the leaves to the root.
+        negatives: whether p₋ is on the edges too, as in LTL2Action.
     """
 
     features: int
     rounds: int
+    negatives: bool = False
 
     def setup(self) -> None:
         """Declares the weights: of a node's own features, and of the message along an edge."""
@@ -92,21 +94,40 @@ class TaskEmbedding(nn.Module):
 
     def __call__(self, tree: TaskTree) -> jax.Array:
         """Embeds all progressions of one task, float32 ``[N, F]``."""
-        sends = tree.valid & (tree.parent >= 0)
-        edge = self.edge(tree.reach.astype(jnp.float32))
-        x = jnp.zeros((tree.num_nodes, self.features))
         if not self.rounds:
-            bias = self.own(x[0])
-
-            def visit(module: TaskEmbedding, incoming: jax.Array, node: jax.Array) -> tuple[jax.Array, jax.Array]:
-                here = nn.tanh(bias + incoming[node])
-                sent = nn.tanh(module.message(here) + edge[node]) * sends[node]
-                return incoming.at[tree.parent[node]].add(sent), here
-
-            return sweep_up(visit, self, x)
+            return self._sweep(tree)[0]
+        sends = tree.valid & (tree.parent >= 0)
+        edge = self._edge(tree)
+        x = jnp.zeros((tree.num_nodes, self.features))
         for _ in range(self.rounds):
             x = nn.tanh(self.own(x) + sum_to_parents(nn.tanh(self.message(x) + edge), tree.parent, sends))
         return x
+
+    def messages(self, tree: TaskTree) -> jax.Array:
+        """What the task beyond each edge has to say, float32 ``[N, F]``; `of_edges` reads it."""
+        return self._sweep(tree)[1]
+
+    def of_edges(self, messages: jax.Array, edges: jax.Array) -> jax.Array:
+        """Embeds the task that begins with some edges (bool ``[..., N]``) of one node, ``[..., F]``."""
+        return nn.tanh(self.own(jnp.zeros(self.features)) + (messages * edges[..., None]).sum(-2))
+
+    def _edge(self, tree: TaskTree) -> jax.Array:
+        parts = [tree.reach, tree.avoid] if self.negatives else [tree.reach]
+        return self.edge(jnp.concatenate(parts, -1).astype(jnp.float32))
+
+    def _sweep(self, tree: TaskTree) -> tuple[jax.Array, jax.Array]:
+        """Embeddings of all progressions, and the message sent along each edge, ``[N, F]`` each."""
+        sends = tree.valid & (tree.parent >= 0)
+        edge = self._edge(tree)
+        nothing = jnp.zeros((tree.num_nodes, self.features))
+        bias = self.own(nothing[0])
+
+        def visit(module: TaskEmbedding, incoming: jax.Array, node: jax.Array) -> tuple[jax.Array, Any]:
+            here = nn.tanh(bias + incoming[node])
+            sent = nn.tanh(module.message(here) + edge[node]) * sends[node]
+            return incoming.at[tree.parent[node]].add(sent), (here, sent)
+
+        return sweep_up(visit, self, nothing)
 
     def of_way(self, ahead: jax.Array) -> jax.Array:
         """Embeds a sequence of sub-tasks as the sweep would, ``[F]``; p₊ is ``[D, P]``, empty rows after its end."""

@@ -127,7 +127,7 @@ def test_help_shows_the_preset_of_the_chosen_recipe(capsys: pytest.CaptureFixtur
 
 @pytest.mark.parametrize("env", ["letter", "letter12"])
 @pytest.mark.parametrize("recipe", ["paper", "hrlspec"])
-@pytest.mark.parametrize("method", ["ours", "myopic-low", "no-er"])
+@pytest.mark.parametrize("method", ["ours", "ltl2action", "option", "myopic-low", "no-er"])
 def test_every_preset_is_accepted(env: str, recipe: str, method: str) -> None:
     for reward_set in (1, 2):
         flags = ["--env", env, "--recipe", recipe, "--method", method, f"--reward-set={reward_set}"]

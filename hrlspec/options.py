@@ -1,0 +1,113 @@
+"""The baseline Option: logic value iteration over what options were measured to take (Araki et al., 2021).
+
+An option reaches one sub-goal and knows nothing of what comes after it. What it takes to reach one sub-goal from
+another is measured while collecting, and a sequence is chosen by dynamic programming over the task tree with that.
+
+Axes: **O** origins, the P propositions reached before and, last, the start of an episode; **P** goals; **N** nodes.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from hrlspec.spec import TaskState, TaskTree, open_edges
+
+FADING = 0.98
+"""What is left of a measurement's weight an iteration later: options change while they are learned."""
+
+
+@struct.dataclass
+class Measurements:
+    """Sums over attempts to reach a goal from an origin, older ones fading.
+
+    Attributes:
+        attempts: float32 ``[O, P]``.
+        discounted: float32 ``[O, P]``, of γ^duration, and 0 where the goal was not reached.
+        successes: float32 ``[2, O, P]``, by whether the sub-task was the last of its task.
+        rewards: float32 ``[2, O, P]``, of what they earned.
+    """
+
+    attempts: jax.Array
+    discounted: jax.Array
+    successes: jax.Array
+    rewards: jax.Array
+
+
+def unmeasured(num_propositions: int) -> Measurements:
+    """One imagined attempt for each pair, which succeeded at once and earned nothing, so that all are tried."""
+    ones = jnp.ones((num_propositions + 1, num_propositions))
+    both = jnp.ones((2, *ones.shape))
+    return Measurements(attempts=ones, discounted=ones, successes=both, rewards=0 * both)
+
+
+def measure(
+    known: Measurements,
+    origin: jax.Array,
+    goal: jax.Array,
+    ended: jax.Array,
+    reached: jax.Array,
+    last: jax.Array,
+    duration: jax.Array,
+    reward: jax.Array,
+    *,
+    discount: float,
+) -> Measurements:
+    """Adds the attempts that ended in a rollout; leading axes of all arrays ``[T, E]``.
+
+    Args:
+        known: what was measured before.
+        origin: bool ``[..., O]``, where each step's sub-task began.
+        goal: bool ``[..., P]``, what it was to reach.
+        ended: bool, the attempt ended with this step.
+        reached: bool, successfully.
+        last: bool, and the task was satisfied by it.
+        duration: int32, steps since the sub-task was assigned, this one included.
+        reward: float32, of this step.
+        discount: γ.
+    """
+    origin, goal = origin.astype(jnp.float32), goal.astype(jnp.float32)
+    success = ended & reached
+    kinds = jnp.stack([success & ~last, success & last]).astype(jnp.float32)
+
+    def total(weight: jax.Array) -> jax.Array:
+        return jnp.einsum("...teo,teg->...og", weight[..., None] * origin, goal)
+
+    return Measurements(
+        attempts=FADING * known.attempts + total(ended.astype(jnp.float32)),
+        discounted=FADING * known.discounted + total(success * discount ** duration.astype(jnp.float32)),
+        successes=FADING * known.successes + total(kinds),
+        rewards=FADING * known.rewards + total(kinds * reward),
+    )
+
+
+def origins(tree: TaskTree) -> jax.Array:
+    """Where a sub-task out of each node begins, bool ``[N, O]``: at what the node reached, or at the start."""
+    start = jnp.arange(tree.num_nodes) == TaskTree.ROOT
+    return jnp.concatenate([tree.reach, start[:, None]], -1)
+
+
+def values(known: Measurements, tree: TaskTree, state: TaskState) -> jax.Array:
+    """Logic value iteration: the discounted reward expected of each open edge and the best way on, float32 ``[N]``.
+
+    ``Q(q, e) = D_e (R_e + max_e' Q(q', e'))`` with the measured E[γ^duration] D_e and reward R_e; -inf on other nodes.
+    A conjunction takes as long as the longest of its goals.
+    """
+    per_attempt = known.discounted / known.attempts
+    per_success = known.rewards / jnp.maximum(known.successes, 1e-6)
+    origin = origins(tree)[tree.parent].astype(jnp.float32)
+    origin = origin / jnp.maximum(origin.sum(-1, keepdims=True), 1.0)
+    reach = jnp.where(tree.reach, origin @ per_attempt, jnp.inf).min(-1)
+    reward = jnp.where(tree.reach, jnp.einsum("no,kop->knp", origin, per_success), -jnp.inf).max(-1)
+    reward = jnp.where(tree.accepting, reward[1], reward[0])
+    edge = tree.valid & (tree.parent >= 0)
+
+    def visit(best: jax.Array, node: jax.Array) -> tuple[jax.Array, jax.Array]:
+        ahead = jnp.where(tree.accepting[node], 0.0, best[node])
+        value = jnp.where(edge[node], reach[node] * (reward[node] + ahead), -jnp.inf)
+        return best.at[tree.parent[node]].max(value), value
+
+    # Children come after their parents, so the last node is visited first.
+    value = jax.lax.scan(visit, jnp.full(tree.num_nodes, -jnp.inf), jnp.arange(tree.num_nodes), reverse=True)[1]
+    return jnp.where(open_edges(tree, state), value, -jnp.inf)
