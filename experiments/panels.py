@@ -1,0 +1,195 @@
+"""What the paper's figures are made of: panels, their curves, and the record that each run leaves behind.
+
+A record is a run's learning curve and final scores, small enough to be kept; figures and claims are drawn from records.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+from experiments.errors import UserError
+from experiments.options import Method, Recipe, RewardSet
+from experiments.run_folder import read_metrics, read_record, read_summary
+
+ENVIRONMENTS = ("letter", "walk", "zone")
+BUDGETS = {"letter": 1_500_000, "walk": 2_000_000, "zone": 4_000_000}
+"""Environment steps of a run."""
+NUM_SEEDS = 5
+POINTS = 20
+"""Evaluations along a curve."""
+_ROW = ("env_steps", "wall_s", "level", "eval/return_mean", "eval/success_rate", "eval/steps_mean", "train/violations")
+
+
+@dataclasses.dataclass(frozen=True)
+class Curve:
+    """One line of a figure.
+
+    Attributes:
+        method: who is trained.
+        recipe: with which settings.
+        switches: flags of ``experiments.run`` that switch techniques off.
+    """
+
+    method: Method
+    recipe: Recipe
+    switches: tuple[str, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """Such as ``ours (paper)``, ``ours without shield (paper)``."""
+        without = "".join(f" without {switch.removeprefix('--no-').replace('-', ' ')}" for switch in self.switches)
+        return f"{self.method}{without} ({self.recipe})"
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """One curve's run in one environment with one seed."""
+
+    env: str
+    reward_set: RewardSet
+    curve: Curve
+    seed: int
+    total_steps: int
+
+    @property
+    def name(self) -> str:
+        """Of its folder and record."""
+        switches = "".join(switch.removeprefix("-") for switch in self.curve.switches)
+        return f"{self.env}-{self.curve.method}-{self.curve.recipe}-set{self.reward_set}{switches}-seed{self.seed}"
+
+    @property
+    def flags(self) -> list[str]:
+        """The flags of ``experiments.run`` that make it, without those that say where."""
+        curve = self.curve
+        told = {
+            "env": self.env,
+            "method": curve.method,
+            "recipe": curve.recipe,
+            "reward-set": self.reward_set,
+            "seed": self.seed,
+            "total-steps": self.total_steps,
+            "evaluation.every": max(1, self.total_steps // POINTS),
+        }
+        return [part for name, value in told.items() for part in (f"--{name}", str(value))] + list(curve.switches)
+
+
+@dataclasses.dataclass(frozen=True)
+class Panel:
+    """One diagram of the paper.
+
+    Attributes:
+        name: what ``reproduce --only`` calls it.
+        title: above the diagram.
+        env: the environment.
+        reward_set: the rewards.
+        curves: the lines.
+    """
+
+    name: str
+    title: str
+    env: str
+    reward_set: RewardSet
+    curves: tuple[Curve, ...]
+
+    def runs(self, num_seeds: int, total_steps: int | None) -> list[Run]:
+        """Its runs, seed by seed, so that all lines grow alike."""
+        steps = total_steps or BUDGETS[self.env]
+        return [Run(self.env, self.reward_set, curve, s, steps) for s in range(num_seeds) for curve in self.curves]
+
+
+_RECIPES: tuple[Recipe, ...] = ("paper", "hrlspec")
+_COMPARED: tuple[Method, ...] = ("ours", "ltl2action", "option")
+_ABLATED: tuple[Method, ...] = ("ours", "myopic-low", "no-er")
+
+
+def _curves(methods: tuple[Method, ...]) -> tuple[Curve, ...]:
+    return tuple(Curve(method, recipe) for recipe in _RECIPES for method in methods)
+
+
+def _comparison(env: str, reward_set: RewardSet) -> Panel:
+    title = f"{env.capitalize()}, reward set {reward_set}"
+    return Panel(f"{env}-set{reward_set}", title, env, reward_set, _curves(_COMPARED))
+
+
+PANELS = {
+    panel.name: panel
+    for panel in (
+        *(_comparison(env, 1) for env in ENVIRONMENTS),
+        *(_comparison(env, 2) for env in ENVIRONMENTS),
+        *(
+            Panel(f"{env}-ablation", f"{env.capitalize()}, ablations", env, 2, _curves(_ABLATED))
+            for env in ENVIRONMENTS
+        ),
+        # Beyond the paper's figures, for two of its claims.
+        Panel(
+            "letter-techniques",
+            "Letter, single techniques",
+            "letter",
+            2,
+            (
+                Curve("ours", "paper"),
+                Curve("ours", "paper", ("--no-max-operator",)),
+                Curve("ours", "paper", ("--no-shield",)),
+            ),
+        ),
+    )
+}
+
+
+def record_of(folder: Path) -> dict[str, Any] | None:
+    """What is kept of a run folder, ``None`` while the run is not finished.
+
+    Raises:
+        UserError: the folder is damaged.
+    """
+    summary = read_summary(folder) if folder.exists() else None
+    if summary is None:
+        return None
+    made = read_record(folder)
+    suite = dict(summary["final"]["suite"])
+    suite.pop("per_task", None)
+    return {
+        "name": summary["name"],
+        "env_steps": summary["env_steps"],
+        "wall_s": summary["wall_s"],
+        "versions": made["versions"],
+        "commit": made["commit"],
+        "machine": made["machine"],
+        "rows": [{name: row.get(name) for name in _ROW} for row in read_metrics(folder)],
+        "final": {**summary["final"], "suite": suite},
+    }
+
+
+def read_run(run: Run, records: Path) -> dict[str, Any] | None:
+    """The record of a run, ``None`` if there is none, or one of another number of steps.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    file = record_file(run, records)
+    try:
+        record: dict[str, Any] = json.loads(file.read_text())
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise UserError(f"cannot read {file}: {error}; without it the run is made again") from error
+    return record if record.get("asked_steps") == run.total_steps else None
+
+
+def write_run(run: Run, record: dict[str, Any], records: Path) -> Path:
+    """Keeps a record, and with it the flags that make the run again."""
+    file = record_file(run, records)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    whole = {"flags": " ".join(run.flags), "asked_steps": run.total_steps, **record}
+    scratch = file.with_suffix(".new")
+    scratch.write_text(json.dumps(whole, indent=1) + "\n")
+    scratch.replace(file)
+    return file
+
+
+def record_file(run: Run, records: Path) -> Path:
+    """Where a run's record is kept."""
+    return records / run.env / f"{run.name}.json"

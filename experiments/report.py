@@ -1,0 +1,140 @@
+"""Figures with 95 % bands and the page of results, drawn from the records of runs alone."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from experiments.claims import (
+    CLAIMS,
+    FEWEST_SEEDS,
+    Record,
+    Records,
+    final_return,
+    finding,
+    mean_return,
+    over_seeds,
+    steps_to_most,
+)
+from experiments.options import Recipe
+from experiments.panels import PANELS, Curve, Panel, Run
+from experiments.progress import duration
+from hrlspec.stats import mean_interval
+
+_ABOUT = """\
+Written by `python -m experiments.reproduce` from the records in `results/paper`; each names the flags that made it.
+Returns are undiscounted means over 2,000 episodes of 200 unseen tasks (at the end) or 100 episodes of 10 (along the
+curves), actions sampled, no shield. Figures are interquartile means over seeds with stratified bootstrap intervals
+(95 %); bands are Student's t intervals. All methods run through the same loop, with the same curriculum and, but for
+No-ER, relabelling. Recipe `paper` collects with the shield, also for Option; LTL2Action has no sub-task and so nothing
+to shield. Recipe `hrlspec` has no shield."""
+_RECIPES: tuple[Recipe, ...] = ("paper", "hrlspec")
+
+
+def write_report(panels: Sequence[Panel], records: Mapping[Run, Record], figures: Path, report: Path) -> Iterator[Path]:
+    """Draws every panel that has records, writes the page, and yields the files one by one.
+
+    Args:
+        panels: what to draw.
+        records: of the runs that are finished.
+        figures: folder for PNG and SVG.
+        report: the page (Markdown).
+    """
+    by_panel = {panel: found for panel in panels if (found := _of_panel(panel, records))}
+    figures.mkdir(parents=True, exist_ok=True)
+    for panel, found in by_panel.items():
+        yield from _draw(panel, found, figures / panel.name)
+    report.parent.mkdir(parents=True, exist_ok=True)
+    report.write_text("\n".join(_page(by_panel, Path(os.path.relpath(figures, report.parent)))) + "\n")
+    yield report
+
+
+def _of_panel(panel: Panel, records: Mapping[Run, Record]) -> dict[Curve, list[Record]]:
+    found: dict[Curve, list[Record]] = {}
+    for run, record in records.items():
+        if (run.env, run.reward_set) == (panel.env, panel.reward_set) and run.curve in panel.curves:
+            found.setdefault(run.curve, []).append(record)
+    return {curve: found[curve] for curve in panel.curves if curve in found}
+
+
+def _draw(panel: Panel, records: Records, file: Path) -> Iterator[Path]:
+    """One axis for each recipe that has curves; PNG and SVG."""
+    recipes = [recipe for recipe in _RECIPES if any(curve.recipe == recipe for curve in records)]
+    figure = Figure(figsize=(0.5 + 4.5 * len(recipes), 3.6), layout="constrained")
+    axes: Any = figure.subplots(1, len(recipes), squeeze=False, sharey=True)
+    for ax, recipe in zip(axes[0], recipes, strict=True):
+        for curve, some in records.items():
+            if curve.recipe == recipe:
+                _band(ax, curve.label.rpartition(" (")[0], some)
+        ax.set_title(f"{panel.title}, recipe {recipe}", fontsize=10)
+        ax.set_xlabel("million environment steps", fontsize=9)
+        ax.grid(alpha=0.3)
+        ax.legend(fontsize=8)
+    axes[0, 0].set_ylabel("average return on unseen tasks", fontsize=9)
+    for suffix in (".png", ".svg"):
+        # Without dates and random names the same records give the same file.
+        metadata = {"Software": None} if suffix == ".png" else {"Date": None}
+        with rc_context({"svg.hashsalt": panel.name}):
+            figure.savefig(file.with_suffix(suffix), dpi=110, metadata=metadata)
+        yield file.with_suffix(suffix)
+
+
+def _band(ax: Axes, label: str, records: Sequence[Record]) -> None:
+    """Mean over seeds, and its 95 % interval by Student's t."""
+    length = min(len(record["rows"]) for record in records)
+    steps = np.array([row["env_steps"] for row in records[0]["rows"][:length]]) / 1e6
+    returns = np.array([[row["eval/return_mean"] for row in record["rows"][:length]] for record in records])
+    intervals = [mean_interval(column) for column in returns.T]
+    (line,) = ax.plot(steps, [interval.estimate for interval in intervals], label=f"{label} ({len(records)})")
+    if len(records) >= FEWEST_SEEDS:
+        low, high = ([getattr(interval, end) for interval in intervals] for end in ("low", "high"))
+        ax.fill_between(steps, low, high, alpha=0.2, color=line.get_color(), linewidth=0)
+
+
+def _page(by_panel: Mapping[Panel, Records], figures: Path) -> Iterator[str]:
+    yield "# Results"
+    yield ""
+    yield _ABOUT
+    yield ""
+    yield "## The paper's claims"
+    yield ""
+    yield "The share is the probability that a run of the one beats a run of the other."
+    yield ""
+    yield "| claim | panel | recipe | share | seeds | verdict |"
+    yield "|---|---|---|---|---|---|"
+    for claim in CLAIMS:
+        for name in claim.panels:
+            for recipe in _RECIPES:
+                found = finding(claim, recipe, by_panel.get(PANELS[name], {}))
+                if found is not None:
+                    seeds = " and ".join(map(str, found.seeds))
+                    yield f"| {claim.text} | {name} | {recipe} | {found.improvement} | {seeds} | {found.verdict} |"
+    for panel, records in by_panel.items():
+        yield ""
+        yield f"## {panel.title}"
+        yield ""
+        yield f"![{panel.title}]({(figures / panel.name).as_posix()}.png)"
+        yield ""
+        yield "| curve | seeds | final return | success | mean of the curve | steps to 90 % of it | ratio | training |"
+        yield "|---|---|---|---|---|---|---|---|"
+        yield from _rows(records)
+
+
+def _rows(records: Records) -> Iterator[str]:
+    """A line for each curve; the ratio is of ours' steps to its own."""
+    ours = {recipe: records.get(Curve("ours", recipe)) for recipe in _RECIPES}
+    fastest = {recipe: over_seeds(steps_to_most, some).estimate for recipe, some in ours.items() if some}
+    for curve, some in records.items():
+        steps = over_seeds(steps_to_most, some).estimate
+        ratio = f"{fastest[curve.recipe] / steps:.2f}" if curve.recipe in fastest else ""
+        success = np.mean([record["final"]["suite"]["success_rate"] for record in some])
+        wall = duration(float(np.mean([record["wall_s"] for record in some])))
+        figures = f"{over_seeds(final_return, some)} | {success:.3f} | {over_seeds(mean_return, some)}"
+        yield f"| {curve.label} | {len(some)} | {figures} | {steps:,.0f} | {ratio} | {wall} |"

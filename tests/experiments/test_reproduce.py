@@ -1,0 +1,184 @@
+"""The paper's figures: what they are made of, how the runs are made, what is written of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from experiments import reproduce
+from experiments.claims import CLAIMS, Claim, Record, final_return, finding, mean_return, no_violations, steps_to_most
+from experiments.errors import Interrupted, UserError
+from experiments.options import experiments_of, parse_run
+from experiments.panels import BUDGETS, PANELS, Curve, Run, read_run, record_file, write_run
+from experiments.report import write_report
+from tests.experiments.tiny import arguments
+
+
+def record(curve: list[float], final: float, violations: float = 0.0) -> dict[str, Any]:
+    """A record of evaluations every 100 steps."""
+    rows = [
+        {"env_steps": 100 * (i + 1), "eval/return_mean": value, "train/violations": violations}
+        for i, value in enumerate(curve)
+    ]
+    return {"wall_s": 60.0, "rows": rows, "final": {"suite": {"return_mean": final, "success_rate": final}}}
+
+
+def test_there_are_nine_panels_of_the_paper_and_one_of_techniques() -> None:
+    kinds = [f"{env}-{kind}" for kind in ("set1", "set2", "ablation") for env in ("letter", "walk", "zone")]
+    assert list(PANELS) == [*kinds, "letter-techniques"]
+    for panel in PANELS.values():
+        assert panel.reward_set == (1 if panel.name.endswith("set1") else 2)
+        assert all(run.total_steps == BUDGETS[panel.env] for run in panel.runs(1, None))
+        assert Curve("ours", "paper") in panel.curves
+    for claim in CLAIMS:
+        for name in claim.panels:
+            for method, switches in (claim.better, claim.worse):
+                assert Curve(method, "paper", switches) in PANELS[name].curves
+
+
+def test_every_run_is_one_that_can_be_made_and_has_a_name_of_its_own() -> None:
+    runs = {run for panel in PANELS.values() for run in panel.runs(1, None)}
+    assert len({run.name for run in runs}) == len(runs) == 50
+    for run in runs:
+        ((experiment, _),) = experiments_of(parse_run(run.flags))
+        assert (experiment.env, experiment.method, experiment.recipe) == (run.env, run.curve.method, run.curve.recipe)
+        assert (experiment.reward_set, experiment.config.total_steps) == (run.reward_set, run.total_steps)
+    (plain, no_max, no_shield) = PANELS["letter-techniques"].runs(1, None)
+    configs = [experiments_of(parse_run(run.flags))[0][0].config for run in (plain, no_max, no_shield)]
+    assert [config.max_operator for config in configs] == [True, False, True]
+    assert [config.shield.mode != "off" for config in configs] == [True, True, False]
+
+
+def test_records_are_kept_for_the_steps_they_were_asked_for(tmp_path: Path) -> None:
+    short, long = (Run("walk", 1, Curve("ours", "paper"), 0, steps) for steps in (100, 200))
+    assert read_run(short, tmp_path) is None
+    kept = write_run(short, record([0.5], 0.5), tmp_path)
+    assert kept == record_file(short, tmp_path)
+    found = read_run(short, tmp_path)
+    assert found is not None
+    assert final_return(found) == 0.5
+    assert "--total-steps 100" in found["flags"]
+    assert read_run(long, tmp_path) is None
+    kept.write_text("{")
+    with pytest.raises(UserError, match="cannot read"):
+        read_run(short, tmp_path)
+
+
+def test_scores_of_a_record() -> None:
+    some = record([0.1, 0.5, 0.7, 0.75, 0.8], final=0.78, violations=0.25)
+    assert final_return(some) == 0.78
+    assert mean_return(some) == pytest.approx(0.57)
+    assert no_violations(some) == -0.25
+    assert steps_to_most(some) == 400  # 0.9 of 0.8 is 0.72
+    assert steps_to_most(record([0.0, 0.0], 0.0)) == 100
+
+
+def test_findings() -> None:
+    claim = Claim("", ("walk-set1",), ("ours", ()), ("option", ()), final_return)
+    rng = np.random.default_rng(0)
+
+    def records(ours: float, option: float, seeds: int = 5) -> dict[Curve, list[Record]]:
+        means = {Curve("ours", "paper"): ours, Curve("option", "paper"): option}
+        return {c: [record([0.0], final=m + 0.01 * rng.normal()) for _ in range(seeds)] for c, m in means.items()}
+
+    def verdict(some: dict[Curve, list[Record]]) -> str | None:
+        found = finding(claim, "paper", some)
+        return None if found is None else found.verdict
+
+    assert verdict(records(0.9, 0.5)) == "holds"
+    assert verdict(records(0.5, 0.9)) == "does not hold"
+    assert verdict(records(0.7, 0.7)) == "undecided"
+    assert verdict(records(0.9, 0.5, seeds=1)) is None
+    assert finding(claim, "hrlspec", records(0.9, 0.5)) is None
+
+
+def test_the_report_is_drawn_from_records_alone_and_always_the_same(tmp_path: Path) -> None:
+    panel = PANELS["letter-techniques"]
+    records = {run: record([0.1 * run.seed, 0.5], 0.5 + 0.1 * run.seed) for run in panel.runs(3, None)}
+    contents = []
+    for name in ("one", "two"):
+        place = tmp_path / name
+        files = list(write_report([panel, PANELS["walk-set1"]], records, place / "figures", place / "docs" / "page.md"))
+        assert [file.name for file in files] == ["letter-techniques.png", "letter-techniques.svg", "page.md"]
+        contents.append([file.read_bytes() for file in files])
+    assert contents[0] == contents[1]
+    page = contents[0][2].decode()
+    assert "](../figures/letter-techniques.png)" in page
+    assert "| ours without max operator (paper) | 3 | 0.600" in page
+    assert "| The max operator helps | letter-techniques | paper | 0.500" in page
+    assert "walk-set1" not in page
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("--only letter-set3", "there is no such panel, expected some of: letter-set1, walk-set1"),
+        ("--seeds 0", "--seeds is 0"),
+        ("--steps -1", "--steps is -1"),
+        ("--jobs 0", "--jobs is 0"),
+        ("--recipes secret", "there is no such recipe"),
+        ("--nonsense", "Unrecognized options: --nonsense"),
+    ],
+)
+def test_bad_input(flags: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=message):
+        reproduce.main(flags.split())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_dry_run_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    panel = PANELS["walk-set1"]
+    done = panel.runs(1, None)[0]
+    write_run(done, record([0.5], 0.5), tmp_path)
+    reproduce.main(["--only", "walk-set1", "--seeds", "2", "--dry-run", "--out", str(tmp_path)])
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 11
+    assert not any("--method ours --recipe paper --reward-set 1 --seed 0" in line for line in lines)
+
+
+def test_what_is_cut_goes_on_and_what_fails_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two real runs, tiny ones: stopped on the way, then ended by the same command; a third one that fails."""
+    where = ["--out", str(tmp_path / "out"), "--work", str(tmp_path / "work"), "--report", str(tmp_path / "page.md")]
+    flags = ["--only", "letter-techniques", "--recipes", "paper", "--seeds", "1", "--jobs", "2", *where]
+    started: list[str] = []
+
+    def command(run: Run, work: Path) -> list[str]:
+        started.append(run.name)
+        if "no-shield" in run.name:
+            return [sys.executable, "-c", "raise SystemExit(2)"]
+        folder = work / run.name
+        resume = ["--resume"] if (folder / "config.json").exists() else []
+        return [sys.executable, "-m", "experiments.run", *arguments(folder), *resume]
+
+    monkeypatch.setattr(reproduce, "_command", command)
+    monkeypatch.setattr(reproduce, "POLL_SECONDS", 0.1)
+    timer = threading.Timer(6.0, os.kill, (os.getpid(), signal.SIGTERM))
+    timer.start()
+    with pytest.raises(Interrupted, match="the same command goes on"):
+        reproduce.main(flags)
+    assert len(started) == 2
+    with pytest.raises(UserError, match="1 runs failed, the first is letter-ours-paper-set2-no-shield-seed0"):
+        reproduce.main(flags)
+    kept = sorted(file.name for file in (tmp_path / "out" / "letter").iterdir())
+    assert kept == ["letter-ours-paper-set2-no-max-operator-seed0.json", "letter-ours-paper-set2-seed0.json"]
+    assert json.loads((tmp_path / "out" / "letter" / kept[0]).read_text())["rows"]
+    # What is done is not done again.
+    before = len(started)
+    monkeypatch.setattr(subprocess, "Popen", lambda *args, **kwargs: pytest.fail("started again"))
+    panel = PANELS["letter-techniques"]
+    monkeypatch.setitem(
+        reproduce.PANELS, "letter-techniques", type(panel)(**{**vars(panel), "curves": panel.curves[:2]})
+    )
+    reproduce.main(flags)
+    assert len(started) == before
+    assert "letter-techniques" in (tmp_path / "page.md").read_text()
