@@ -166,7 +166,7 @@ def zone(config: Config) -> Config:
         total_steps=10_000_000,
         discount=0.998,
         noise_correlation=0.95,
-        network=dataclasses.replace(config.network, encoder_mlp=(128,), latent=128),
+        network=dataclasses.replace(config.network, encoder_mlp=(128, 128), latent=128),
         curriculum=dataclasses.replace(config.curriculum, levels=3, max_avoid=2),
     )
 
