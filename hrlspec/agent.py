@@ -130,7 +130,7 @@ class Agent:
             return dataclasses.replace(jax.tree.map(lambda x: x[(*where, edge)], told), ahead=ahead)
         future: Any = self.controller.apply(params["controller"], told.future[where], feasible, method="remaining")
         nothing = jnp.zeros((*edge.shape, told.reach.shape[-1]))
-        return Instruction(reach=nothing, avoid=nothing, others=nothing, ahead=ahead, future=future)
+        return Instruction(reach=nothing, avoid=nothing, ahead=ahead, future=future)
 
     def plan(self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction) -> Estimate:
         """The planner on one environment: logits over edges ``[N]`` and the value of the remaining task ``[]``."""

@@ -41,9 +41,6 @@ class NetworkConfig:
     roles: bool = False
     """Task-conditioned encoding: the low level sees the observation by role (the goal p₊, the forbidden p₋, what comes
     1, 2, ... sub-tasks later) instead of by name. Off encodes the observation without the task, as in the paper."""
-    siblings: bool = False
-    """Whether the low level is told what sibling edges reach apart from what the sub-task's ``ensuring`` forbids. Off
-    both are one, p₋ (eq. 2); but the first only leads elsewhere, while the second may end the task."""
     names: bool = False
     """Whether the low level sees the observation by role and by name: where rewards depend on propositions that have no
     role in the task."""

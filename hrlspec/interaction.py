@@ -142,7 +142,7 @@ def act(
     def one(view: View, told: Instruction, noise: jax.Array) -> Any:
         outputs, value = agent.control(params, view, told)
         action, log_prob = agent.actions.sample(outputs, noise)
-        safe = shielded_action(agent, params, view, told.avoid + told.others > 0, action) if shield else action
+        safe = shielded_action(agent, params, view, told.avoid > 0, action) if shield else action
         return safe, log_prob, value, (safe != action).any()
 
     feasible = jax.vmap(open_edges)(task_of(book, worker.task), worker.task_state)

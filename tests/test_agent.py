@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from types import SimpleNamespace
 from typing import Any
 
@@ -87,10 +86,7 @@ def trees() -> TaskTree:
     return on_device(jax.tree.map(lambda *x: np.stack(x), *many))
 
 
-@pytest.mark.parametrize("siblings", [False, True])
-def test_the_book_holds_each_sub_tasks_avoid_set(siblings: bool, trees: TaskTree) -> None:
-    network = dataclasses.replace(small_config().network, siblings=siblings)
-    agent = Agent(Corridor(), small_config(network=network))
+def test_the_book_holds_each_sub_tasks_avoid_set(agent: Agent, trees: TaskTree) -> None:
     params = random_params(agent, 0)
     book = quick_jit(agent.open_book)(params, trees)
     instruct = quick_jit(agent.instruct)
@@ -100,11 +96,10 @@ def test_the_book_holds_each_sub_tasks_avoid_set(siblings: bool, trees: TaskTree
         jax.tree.map(lambda x, y, m=m: np.testing.assert_allclose(x[m], y, atol=1e-6), book.told, alone)
         np.testing.assert_array_equal(book.told.reach[m], tree.reach)
         for k in range(6):
-            beside = [j for j in range(6) if tree.valid[j] and tree.parent[j] == tree.parent[k] >= 0 and j != k]
-            reached = set().union(*(pairs(tree.reach[j]) for j in beside))
-            own, others = (pairs(tree.avoid[k]), reached - pairs(tree.reach[k])) if tree.valid[k] else (set(), set())
-            told = book.told.avoid[m, k], book.told.others[m, k]
-            assert tuple(map(pairs, told)) == ((own, others - own) if siblings else (own | others, set()))
+            siblings = [j for j in range(6) if tree.valid[j] and tree.parent[j] == tree.parent[k] >= 0 and j != k]
+            reached = set().union(*(pairs(tree.reach[j]) for j in siblings))
+            expected = pairs(tree.avoid[k]) | (reached - pairs(tree.reach[k])) if tree.valid[k] else set()
+            assert pairs(book.told.avoid[m, k]) == expected
 
 
 def test_myopic_low_sees_nothing_of_the_future(trees: TaskTree) -> None:

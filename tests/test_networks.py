@@ -256,8 +256,7 @@ def test_the_low_level_turns_with_the_world() -> None:
     assert turns is not None
     params = random_params(agent, 3)
     letters = np.eye(env.num_propositions, dtype=np.float32)
-    future, nothing = np.zeros(network.task_features), 0 * letters[0]
-    told = Instruction(reach=letters[0], avoid=letters[1], others=nothing, ahead=letters[2:], future=future)
+    told = Instruction(reach=letters[0], avoid=letters[1], ahead=letters[2:], future=np.zeros(network.task_features))
     control = quick_jit(lambda view: agent.control(params, view, told))
     straight = 0
     for seed in range(10):

@@ -28,8 +28,7 @@ class Instruction:
 
     Attributes:
         reach: float32 ``[P]``, p₊ of the assigned sub-task.
-        avoid: float32 ``[P]``, p₋ (eq. 2), or with ``siblings`` only the ``ensuring`` part of it.
-        others: float32 ``[P]``, the rest of p₋: what sibling edges reach; zeros without ``siblings``.
+        avoid: float32 ``[P]``, p₋ (eq. 2).
         ahead: float32 ``[D, P]``, what may be reached 1, 2, ... sub-tasks after it.
         future: float32 ``[F]``, embedding of the task that remains after it, or of the whole remaining task where no
             sub-task is assigned.
@@ -37,7 +36,6 @@ class Instruction:
 
     reach: jax.Array
     avoid: jax.Array
-    others: jax.Array
     ahead: jax.Array
     future: jax.Array
 
@@ -117,12 +115,9 @@ class Controller(nn.Module):
         """
         depth = self.config.lookahead if self.config.roles else 0
         embed = self.task_embedding.messages if self.config.whole_task else self.task_embedding
-        forbidden = subtask_avoid(tree)
-        own = tree.avoid if self.config.siblings else forbidden
         return Instruction(
             reach=tree.reach.astype(jnp.float32),
-            avoid=own.astype(jnp.float32),
-            others=(forbidden & ~own).astype(jnp.float32),
+            avoid=subtask_avoid(tree).astype(jnp.float32),
             ahead=lookahead(tree, depth).astype(jnp.float32),
             future=embed(tree),
         )
@@ -144,10 +139,7 @@ class Controller(nn.Module):
         planes, shared = view
         if self.config.roles:
             # By role the encoder need not push the whole observation through its latent to find the goal afterwards.
-            seen_as = [told.reach[None], told.avoid[None], told.ahead]
-            if self.config.siblings:
-                seen_as.append(told.others[None])
-            roles = jnp.tensordot(jnp.concatenate(seen_as), planes, axes=1)
+            roles = jnp.tensordot(jnp.concatenate([told.reach[None], told.avoid[None], told.ahead]), planes, axes=1)
             planes = jnp.concatenate([roles, planes]) if self.config.names else roles
         order = None
         if self.config.roles and self.config.symmetric and self.symmetries:
@@ -155,8 +147,7 @@ class Controller(nn.Module):
         latent = nn.relu(self.encoder(planes, shared))
         # With the planner's advice there is a plan, and what remains is the rest of the plan.
         future = self.task_embedding.of_way(told.ahead) if self.config.advice else told.future
-        orders = [told.reach, told.avoid, told.others] if self.config.siblings else [told.reach, told.avoid]
-        x = jnp.concatenate([latent, *orders, future])
+        x = jnp.concatenate([latent, told.reach, told.avoid, future])
         outputs = self.actor(x)
         return outputs if order is None else outputs[order], self.critic(x)[0]
 

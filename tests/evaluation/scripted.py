@@ -39,8 +39,7 @@ class Walker(Agent):
         child = tree.parent[None, :] == jnp.arange(tree.num_nodes)[:, None]
         following = jnp.where(child.any(-1)[:, None], tree.reach[child.argmax(-1)], False)
         reach, avoid, ahead = (x.astype(jnp.float32) for x in (tree.reach, subtask_avoid(tree), following[:, None]))
-        future = jnp.zeros((tree.num_nodes, 0))
-        return Instruction(reach=reach, avoid=avoid, others=jnp.zeros_like(avoid), ahead=ahead, future=future)
+        return Instruction(reach=reach, avoid=avoid, ahead=ahead, future=jnp.zeros((tree.num_nodes, 0)))
 
     def plan_ahead(
         self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
