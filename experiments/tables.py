@@ -44,7 +44,7 @@ def suite_table(result: SuiteResult) -> Table:
         remarks.append(f"steps over optimum: {total.steps_mean.estimate / total.optimal_steps_mean:.3f}")
     if total.myopic_spl is not None:
         remarks.append(f"nearest goal first: success {total.myopic_success_rate:.3f}, SPL {total.myopic_spl:.3f}")
-    table = _table(
+    table = plain_table(
         f"Unseen tasks: {result.suite} ({len(result.per_task)} tasks, {total.episodes} episodes)",
         ["tasks", *(_NAMES[name] for name in names)],
         "; ".join(remarks),
@@ -61,7 +61,7 @@ def final_tables(results: FinalResults) -> list[Table]:
     tables = [suite_table(results.suite)]
     if results.choice is not None:
         choice = results.choice
-        table = _table(
+        table = plain_table(
             f"Contested choice ({choice.episodes} layouts)",
             ["right choices", "nearest is wrong", "nearest is right", "failures"],
             "always the nearest instance, or always another, scores 0.5; failures count as wrong",
@@ -70,7 +70,7 @@ def final_tables(results: FinalResults) -> list[Table]:
         tables.append(table)
     if results.returns is not None:
         returns = results.returns
-        table = _table(
+        table = plain_table(
             f"Return over optimum where the branch matters ({returns.episodes} cases)",
             ["agent", "random branch", "longest branch"],
         )
@@ -81,7 +81,7 @@ def final_tables(results: FinalResults) -> list[Table]:
 
 def aggregate_table(name: str, aggregates: Mapping[str, Aggregate]) -> Table:
     """Several seeds put together."""
-    table = _table(
+    table = plain_table(
         name,
         ["unseen tasks", "seeds", "mean over seeds", "interquartile mean"],
         "95 % intervals; the interquartile mean's is a bootstrap over seeds",
@@ -93,7 +93,8 @@ def aggregate_table(name: str, aggregates: Mapping[str, Aggregate]) -> Table:
     return table
 
 
-def _table(title: str, columns: Sequence[str], caption: str | None = None) -> Table:
+def plain_table(title: str, columns: Sequence[str], caption: str | None = None) -> Table:
+    """An empty table with a line below its head; the first column is flush left, the others right."""
     table = Table(title=title, caption=caption, box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
     for i, column in enumerate(columns):
         table.add_column(column, justify="right" if i else "left", no_wrap=True)

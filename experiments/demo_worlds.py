@@ -1,0 +1,159 @@
+"""The two worlds of the paper's motivating examples, small enough to be learned in a minute.
+
+Axes: **H** rows, **W** columns.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from envs_jax import Box, Discrete, Environment, EnvParams, Walk
+from envs_jax.base import StepResult
+
+ROOM = 3
+"""Cells along each side of a room."""
+ROWS, COLUMNS = ROOM, 3 * ROOM + 2
+DOORS = (ROOM, 2 * ROOM + 1)
+"""Columns of the two walls, each with a door in the middle; the second is locked."""
+MIDDLE = ROOM // 2
+_MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)], np.int32)
+
+
+@struct.dataclass
+class RoomsLayout:
+    """Cells, row and column: the start and the key in the first room, a red ball in the second, a blue in the third."""
+
+    start: jax.Array  # int32 [2]
+    key: jax.Array  # int32 [2]
+    red: jax.Array  # int32 [2]
+    blue: jax.Array  # int32 [2]
+
+
+@struct.dataclass
+class RoomsState:
+    """A running episode."""
+
+    position: jax.Array  # int32 [2]
+    has_key: jax.Array  # bool []
+    layout: RoomsLayout
+    time: jax.Array  # int32 []
+
+
+@dataclasses.dataclass(frozen=True)
+class Rooms(Environment):
+    """Three rooms in a row; the door to the last is locked, and the key, which no task speaks of, lies in the first.
+
+    Observation: float32 ``[4, H, W]``: red ball, blue ball, agent, key (gone when it was taken). Actions: 0 up, 1 down,
+    2 left, 3 right; walls and the locked door let nobody through. Labels: in which ball's cell the agent is.
+    """
+
+    horizon: int = 60
+    name: str = "rooms"
+    propositions = ("blue", "red")
+    action_space = Discrete(n=4)
+    observation_shape = (4, ROWS, COLUMNS)
+    observation_space = Box(low=0.0, high=1.0, shape=(4, ROWS, COLUMNS))
+
+    def sample_layout(self, key: jax.Array, params: EnvParams) -> RoomsLayout:
+        """Uniform cells in their rooms; the key at the far wall, on no direct way from the start to the door."""
+        del params
+        rows = jax.random.randint(key, (4,), 0, ROOM)
+        columns = jax.random.randint(jax.random.fold_in(key, 1), (4,), jnp.array([1, 0, 0, 0]), ROOM)
+        columns = columns.at[1].set(0) + (ROOM + 1) * np.array([0, 0, 1, 2])
+        return RoomsLayout(*jnp.stack([rows, columns], -1).astype(jnp.int32))
+
+    def resample_layout(self, key: jax.Array, layout: RoomsLayout, needed: jax.Array, params: EnvParams) -> RoomsLayout:
+        """Another layout where ``needed``; the start moves on by a cell if all were drawn alike."""
+        drawn = self.sample_layout(key, params)
+        same = jnp.stack([(x == y).all() for x, y in zip(jax.tree.leaves(drawn), jax.tree.leaves(layout), strict=True)])
+        start = jnp.where(same.all(), drawn.start.at[0].set((drawn.start[0] + 1) % ROWS), drawn.start)
+        return jax.tree.map(
+            lambda new, old: jnp.where(needed, new, old), dataclasses.replace(drawn, start=start), layout
+        )
+
+    def check_layout(self, layout: RoomsLayout) -> None:
+        """Raises ``ValueError`` unless everything lies in its room."""
+        for name, room in (("start", 0), ("key", 0), ("red", 1), ("blue", 2)):
+            row, column = np.asarray(getattr(layout, name)) - (0, room * (ROOM + 1))
+            if not (0 <= row < ROOM and 0 <= column < ROOM):
+                raise ValueError(f"{name} is not in room {room + 1}")
+
+    def reset_to(self, layout: RoomsLayout, key: jax.Array, params: EnvParams) -> tuple[jax.Array, RoomsState]:
+        """Starts without the key."""
+        del key
+        layout = jax.tree.map(jnp.asarray, layout)
+        state = RoomsState(layout.start, (layout.start == layout.key).all(), layout, jnp.int32(0))
+        return self.observation(state, params), state
+
+    def step_env(self, key: jax.Array, state: RoomsState, action: jax.Array, params: EnvParams) -> StepResult:
+        """One move."""
+        del key
+        there = state.position + jnp.asarray(_MOVES)[action]
+        row, column = there
+        inside = (row >= 0) & (row < ROWS) & (column >= 0) & (column < COLUMNS)
+        through = (row == MIDDLE) & ((column == DOORS[0]) | state.has_key)
+        wall = (column == DOORS[0]) | (column == DOORS[1])
+        position = jnp.where(inside & (~wall | through), there, state.position)
+        has_key = state.has_key | (position == state.layout.key).all()
+        state = RoomsState(position, has_key, state.layout, state.time + 1)
+        return (
+            self.observation(state, params),
+            state,
+            jnp.float32(0),
+            jnp.bool_(False),
+            state.time >= params.horizon,
+            {},
+        )
+
+    def labels(self, state: RoomsState, params: EnvParams) -> jax.Array:
+        """Which ball's cell the agent is in."""
+        del params
+        return jnp.stack([(state.position == ball).all() for ball in (state.layout.blue, state.layout.red)])
+
+    def observation(self, state: RoomsState, params: EnvParams) -> jax.Array:
+        """One image each for blue, red, the agent and the key."""
+        del params
+        layout = state.layout
+        images = [_image(x) for x in (layout.blue, layout.red, state.position)]
+        return jnp.stack([*images, _image(layout.key) * ~state.has_key]).astype(jnp.float32)
+
+    def proposition_view(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The balls belong to propositions, agent and key to none."""
+        return observation[:2], observation[2:].reshape(-1)
+
+
+def _image(cell: jax.Array) -> jax.Array:
+    return (np.arange(ROWS)[:, None] == cell[0]) & (np.arange(COLUMNS) == cell[1])
+
+
+def fewest_steps(layout: RoomsLayout, *, key_first: bool) -> int:
+    """Steps to the red and then the blue ball, with the key fetched before the red ball or only afterwards."""
+    between = (layout.key, layout.red) if key_first else (layout.red, layout.key)
+    stops = [np.asarray(stop) for stop in (layout.start, *between, layout.blue)]
+    return sum(_distance(here, there) for here, there in itertools.pairwise(stops))
+
+
+def _distance(here: np.ndarray, there: np.ndarray) -> int:
+    """Steps through the doors between two cells."""
+    if here[1] // (ROOM + 1) != there[1] // (ROOM + 1):
+        rows = abs(here[0] - MIDDLE) + abs(there[0] - MIDDLE)
+    else:
+        rows = abs(here[0] - there[0])
+    return int(rows + abs(here[1] - there[1]))
+
+
+DILEMMA = Walk(
+    discs=(("a", 2.2, 1.0, 0.7), ("b", 4.6, 2.2, 0.7), ("c", 7.6, 2.4, 0.7), ("d", 6.2, 0.9, 0.7)),
+    low=-1.0,
+    high=9.0,
+    horizon=200,
+    name="dilemma",
+)
+"""The way to b leads past a, and reaching a ends the task before c, which pays most, can be reached."""
+DILEMMA_TASK = "achieve a ensuring not d or achieve b ensuring not d; (achieve c ensuring not d)"
