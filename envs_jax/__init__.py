@@ -9,7 +9,7 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-from envs_jax.base import Box, Discrete, Environment, EnvParams, Symmetries
+from envs_jax.base import Box, Discrete, Environment, EnvParams, Reflections, Symmetries
 from envs_jax.layouts import load_layouts, save_layouts
 from envs_jax.letter import Letter, LetterState
 from envs_jax.walk import Walk, WalkLayout, WalkState, flatworld
@@ -21,6 +21,7 @@ __all__ = [
     "Environment",
     "Letter",
     "LetterState",
+    "Reflections",
     "Symmetries",
     "Walk",
     "WalkLayout",

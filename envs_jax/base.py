@@ -99,6 +99,29 @@ class Symmetries:
     actions: tuple[tuple[int, ...], ...]
 
 
+@dataclasses.dataclass(frozen=True)
+class Reflections:
+    """Says that a world of vectors stays the same world, or nearly, when it is reflected in the agent's axes.
+
+    Reflection k reads feature i of each proposition at ``features[k][i]`` and shared feature j at ``shared[k][j]``,
+    times ``signs[k][j]``; an action a in the reflected world is ``actions[k] · a`` in the world itself. Hashable, as
+    `Symmetries`.
+
+    Attributes:
+        features: K orders of a proposition's L features; the first reflection changes nothing.
+        shared: K orders of the F0 shared features.
+        signs: their signs, K by F0.
+        actions: signs of the A coordinates of an action, K by A.
+        sector: L weights, largest for features that lie in the sector which is to hold the goal.
+    """
+
+    features: tuple[tuple[int, ...], ...]
+    shared: tuple[tuple[int, ...], ...]
+    signs: tuple[tuple[float, ...], ...]
+    actions: tuple[tuple[float, ...], ...]
+    sector: tuple[float, ...]
+
+
 class Environment(abc.ABC):
     """A world with labels. Rewards come from tasks, so environments pay 0 and end episodes by truncation only.
 
@@ -133,8 +156,8 @@ class Environment(abc.ABC):
         """Where actions lie."""
 
     @property
-    def symmetries(self) -> Symmetries | None:
-        """Set where turning all images changes nothing but the actions' names."""
+    def symmetries(self) -> Symmetries | Reflections | None:
+        """Set where turning or reflecting all that is seen changes nothing but the actions' names or signs."""
         return None
 
     @property

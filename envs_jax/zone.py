@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ import numpy as np
 from flax import struct
 
 from envs_jax import zone_physics
-from envs_jax.base import Box, Environment, EnvParams, StepResult
+from envs_jax.base import Box, Environment, EnvParams, Reflections, StepResult
 from envs_jax.zone_contested import contested_layout
 from envs_jax.zone_layouts import COLOURS, ZONES_EACH, ZoneLayout, new_layout
 from envs_jax.zone_physics import NUM_SENSORS, Backend
@@ -145,6 +146,35 @@ class Zone(Environment):
         contested = contested_layout(key, jnp.argmax(first), jnp.argmax(second), mirrored=mirrored, needed=wanted)
         return jax.tree.map(lambda this, other: jnp.where(wanted, this, other), contested, plain)
 
+    @functools.cached_property
+    def symmetries(self) -> Reflections:
+        """Left for right, and front for back: the robot drives both ways.
+
+        The second is not exact: the robot's centre of mass lies 2 cm before its origin.
+        """
+        bins = np.arange(LIDAR_BINS)
+        # Signs of three readings each of accelerometer, velocimeter, gyro and magnetometer (the field is along y).
+        side = [1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, 1]
+        back = [-1, -1, 1] * 4
+        rest = 0 if self.walls else 4
+        features, shared, signs, actions = [], [], [], []
+        for to_back, to_side in itertools.product((False, True), repeat=2):
+            order = LIDAR_BINS - 1 - bins if to_side else bins
+            features.append(np.roll(order, LIDAR_BINS // 2 * to_back))
+            walls = np.array([0, 3, 2, 1] if to_side else [0, 1, 2, 3])[:rest]
+            shared.append(np.concatenate([np.arange(NUM_SENSORS), NUM_SENSORS + walls]))
+            sign = np.where(to_side, side, 1) * np.where(to_back, back, 1)
+            signs.append(np.concatenate([sign, np.ones(rest)]))
+            actions.append([1 - 2 * to_back, 1 - 2 * to_side])
+        bearing = (bins + 0.5) * (2 * np.pi / LIDAR_BINS)
+        return Reflections(
+            features=_tuples(features),
+            shared=_tuples(shared),
+            signs=_tuples(signs),
+            actions=_tuples(actions),
+            sector=tuple((np.cos(bearing) + 0.3 * np.sin(bearing)).tolist()),
+        )
+
     @property
     def contested_pairs(self) -> tuple[tuple[int, int], ...]:
         """Colours to go to first and then that a contested layout can be about: the first leaves the second there."""
@@ -257,6 +287,10 @@ def lidar_readings(body: jax.Array, zones: jax.Array, gain: float) -> jax.Array:
     bins = np.arange(LIDAR_BINS)
     near = jnp.where(bin_index == (bins + 1) % LIDAR_BINS, before, jnp.where(bin_index == bins, value, 0.0))
     return jnp.where(bin_index == (bins - 1) % LIDAR_BINS, after, near).max(-2)
+
+
+def _tuples(rows: Any) -> tuple[tuple[Any, ...], ...]:
+    return tuple(tuple(row) for row in np.array(rows).tolist())
 
 
 def _no_layout() -> ZoneLayout:

@@ -269,3 +269,27 @@ def test_the_low_level_turns_with_the_world() -> None:
             np.testing.assert_allclose(same, value, rtol=1e-4, atol=1e-4)
         straight += len(np.unique(np.round(np.asarray(outputs), 3)))
     assert straight > 20  # the outputs do tell the actions apart
+
+
+def test_the_low_level_is_reflected_with_the_world() -> None:
+    """Seen in any of the four mirrors, its actions are reflected likewise, and it values what it sees alike."""
+    env = envs_jax.make("zone", physics="closed-form")
+    network = dataclasses.replace(small_config().network, lookahead=2, symmetric=True)
+    agent, mirrors = Agent(env, small_config(network=network)), env.symmetries
+    params = random_params(agent, 3)
+    colours = np.eye(4, dtype=np.float32)
+    told = Instruction(reach=colours[0], avoid=colours[1], ahead=colours[2:], future=np.zeros(network.task_features))
+    control = quick_jit(lambda view: agent.control(params, view, told))
+    rng = np.random.default_rng(0)
+    actions = set()
+    for _ in range(10):
+        lidar, shared = rng.random((4, 16)).astype(np.float32), rng.normal(size=16).astype(np.float32)
+        outputs, value = control((lidar, shared))
+        actions.add(tuple(np.sign(outputs[:2]).tolist()))
+        for k in range(4):
+            reflected = lidar[:, np.array(mirrors.features[k])], shared[np.array(mirrors.shared[k])] * mirrors.signs[k]
+            again, same = control(reflected)
+            np.testing.assert_allclose(again[:2] * np.array(mirrors.actions[k]), outputs[:2], rtol=1e-3, atol=1e-4)
+            np.testing.assert_allclose(again[2:], outputs[2:], rtol=1e-3, atol=1e-4)
+            np.testing.assert_allclose(same, value, rtol=1e-3, atol=1e-4)
+    assert len(actions) > 1

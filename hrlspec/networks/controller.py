@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs_jax import Symmetries
+from envs_jax import Reflections, Symmetries
 from hrlspec.config import NetworkConfig
 from hrlspec.networks.encoder import MLP, Encoder
 from hrlspec.networks.tree import TaskEmbedding, lookahead
@@ -67,6 +67,35 @@ def turn(planes: jax.Array, symmetries: Symmetries, lookahead: int) -> tuple[jax
     return planes, jnp.asarray(symmetries.actions, jnp.int32)[best]
 
 
+def reflect(
+    planes: jax.Array, shared: jax.Array, reflections: Reflections, lookahead: int
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Reflects vectors by role so that what comes after the goal, or else the goal, lies in the sector.
+
+    Were it the goal first, the nearest of its instances would nearly always be right; see `sector_weights`.
+
+    Args:
+        planes: float32 ``[R, L]``: the goal, what to avoid, what lies ahead.
+        shared: float32 ``[F0]``.
+        reflections: how they may be reflected.
+        lookahead: how many rows tell what lies ahead.
+
+    Returns:
+        Both, reflected, and the signs of actions, float32 ``[A]``.
+    """
+    orders = np.array(reflections.features)
+    # Weights of the features as they are, one row for each reflection.
+    weights = np.array(reflections.sector, np.float32)[np.argsort(orders)]
+    after = planes[2] if lookahead else jnp.zeros_like(planes[0])
+    best = jnp.argmax(weights @ (0.05 * planes[0] + after))
+
+    def chosen(rows: Any) -> jax.Array:
+        return jnp.asarray(np.array(rows))[best]
+
+    planes = planes[:, chosen(orders)]
+    return planes, shared[chosen(reflections.shared)] * chosen(reflections.signs), chosen(reflections.actions)
+
+
 TURNS = tuple(itertools.product((False, True), repeat=3))
 """Transpose, reverse rows, reverse columns: in the order of :class:`envs_jax.Symmetries`."""
 
@@ -93,12 +122,12 @@ class Controller(nn.Module):
     Attributes:
         config: sizes.
         num_outputs: of the actor; they describe a distribution of ``hrlspec.actions``.
-        symmetries: how the world can be turned, if at all.
+        symmetries: how the world can be turned or reflected, if at all.
     """
 
     config: NetworkConfig
     num_outputs: int
-    symmetries: Symmetries | None = None
+    symmetries: Symmetries | Reflections | None = None
 
     def setup(self) -> None:
         """Declares the parts."""
@@ -141,15 +170,23 @@ class Controller(nn.Module):
             # By role the encoder need not push the whole observation through its latent to find the goal afterwards.
             roles = jnp.tensordot(jnp.concatenate([told.reach[None], told.avoid[None], told.ahead]), planes, axes=1)
             planes = jnp.concatenate([roles, planes]) if self.config.names else roles
-        order = None
-        if self.config.roles and self.config.symmetric and self.symmetries:
-            planes, order = turn(planes, self.symmetries, told.ahead.shape[0])
+        order = signs = None
+        symmetries = self.symmetries if self.config.roles and self.config.symmetric else None
+        if isinstance(symmetries, Symmetries):
+            planes, order = turn(planes, symmetries, told.ahead.shape[0])
+        elif isinstance(symmetries, Reflections):
+            planes, shared, signs = reflect(planes, shared, symmetries, told.ahead.shape[0])
         latent = nn.relu(self.encoder(planes, shared))
         # With the planner's advice there is a plan, and what remains is the rest of the plan.
         future = self.task_embedding.of_way(told.ahead) if self.config.advice else told.future
         x = jnp.concatenate([latent, told.reach, told.avoid, future])
         outputs = self.actor(x)
-        return outputs if order is None else outputs[order], self.critic(x)[0]
+        if order is not None:
+            outputs = outputs[order]
+        elif signs is not None:
+            # The outputs are means and deviations: a mean changes its sign with the action, its deviation does not.
+            outputs = outputs * jnp.concatenate([signs, jnp.ones(self.num_outputs - len(signs))])
+        return outputs, self.critic(x)[0]
 
     def everything(self, view: tuple[jax.Array, jax.Array], tree: TaskTree) -> tuple[jax.Array, jax.Array]:
         """Touches every parameter, for initialisation."""

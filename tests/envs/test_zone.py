@@ -246,6 +246,32 @@ def test_contested_where_two_colours_are_given() -> None:
     assert ((pair[0] - robot) * (drawn.zones[0, 0] - robot)).sum() > 0 > ((pair[1] - robot) * (pair[0] - robot)).sum()
 
 
+@pytest.mark.parametrize("reflection", [0, 1, 2, 3])
+def test_what_happens_in_a_mirror(reflection: int) -> None:
+    """A step of the reflected robot, reflected back, is the robot's own; front for back but for 2 cm of its mass."""
+    symmetries, to_back, to_side = ENV.symmetries, *divmod(reflection, 2)
+    order, shared, signs, action_signs = (
+        np.array(getattr(symmetries, name)[reflection]) for name in ("features", "shared", "signs", "actions")
+    )
+    rng = np.random.default_rng(reflection)
+    step = jax.jit(ENV.step_env)
+    for key in jax.random.split(jax.random.key(reflection), 5):
+        _, state = ENV.reset(key, PARAMS)
+        for action in rng.uniform(-1, 1, (20, 2)):
+            state = step(key, state, action, PARAMS)[1]
+        mirror = np.array([1.0, 1 - 2 * to_side])
+        body = state.body * np.array([1, mirror[1], mirror[1]] * 2) + np.array([0, 0, to_back * np.pi, 0, 0, 0])
+        other = state.replace(body=body, layout=state.layout.replace(zones=state.layout.zones * mirror))
+        action = rng.uniform(-1, 1, 2)
+        lidar, rest = ENV.proposition_view(step(key, state, action, PARAMS)[0])
+        lidar_there, rest_there = ENV.proposition_view(step(key, other, action * action_signs, PARAMS)[0])
+        np.testing.assert_allclose(lidar_there[:, order], lidar, atol=0.01 if to_back else 1e-4)
+        off = np.abs(rest_there[shared] * signs - rest)
+        assert off[3:].max() < (0.2 if to_back else 1e-3)
+        if not to_back:
+            assert off[:3].max() < 1e-3  # the accelerometer feels where the mass is
+
+
 def test_contests_are_about_colours_that_stay() -> None:
     assert set(ENV.contested_pairs) == {(i, j) for i in range(4) for j in range(4) if i != j}
     blue, green = (ENV.propositions.index(colour) for colour in ("blue", "green"))
