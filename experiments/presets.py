@@ -155,6 +155,8 @@ def walk(config: Config) -> Config:
         discount=0.99,
         # White noise stays within a unit of the start, and the nearest region is three away.
         noise_correlation=0.98,
+        # Some ways between regions are rare: with a quarter of the environments success after 2 M steps was 0.87 once.
+        relabel=dataclasses.replace(config.relabel, share=0.5),
     )
 
 
