@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from experiments import platform
 from experiments.command import parse_flags
@@ -28,6 +29,7 @@ from hrlspec.evaluation import Suite, evaluate_suite, suite_from_text
 from hrlspec.evaluation.suite import MAX_NODES
 
 PROGRAM = "python -m experiments.evaluate"
+MOST_PICTURES = 9
 _LARGEST_FILE = 1_000_000  # bytes
 
 
@@ -58,6 +60,8 @@ class EvaluateFlags:
     """Replace actions that would step on forbidden propositions."""
     max_nodes: int = MAX_NODES
     """Largest task tree."""
+    draw: Path | None = None
+    """A picture (.png or .svg) of one episode of each task, of the first nine."""
     json: bool = False
     """Print one JSON object and nothing else on standard output."""
 
@@ -94,6 +98,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         )
     except ValueError as error:
         raise UserError(str(error)) from error  # a task that nothing can satisfy
+    if flags.draw is not None:
+        _draw(flags, agent, params, experiment, suite)
     if flags.json:
         facts: dict[str, Any] = {"run": str(flags.run), "checkpoint_step": step, "reward_set": experiment.reward_set}
         print(json.dumps({**facts, **result.to_json()}, allow_nan=False))
@@ -105,6 +111,17 @@ def main(argv: Sequence[str] | None = None) -> None:
             score = task.score
             line = f"{score.success_rate.estimate:.3f}  {task.task}"
             console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _draw(flags: EvaluateFlags, agent: Agent, params: Params, experiment: Experiment, suite: Suite) -> None:
+    from experiments import plots
+
+    assert flags.draw is not None
+    some = suite.take(np.arange(min(len(suite), MOST_PICTURES)))
+    machine = rewards_of(experiment.env, experiment.reward_set)
+    episodes = plots.episodes_of(jax.random.key(flags.seed), agent, params, machine, some)
+    flags.draw.parent.mkdir(parents=True, exist_ok=True)
+    plots.gallery(episodes, agent.env.propositions, flags.draw)
 
 
 def load_params(agent: Agent, run: Path, step: int | None = None) -> tuple[Params, int]:
@@ -152,6 +169,8 @@ def _check(flags: EvaluateFlags) -> None:
     if len(given) != 1:
         found = " and ".join(f"--{name.replace('_', '-')}" for name in given) or "none"
         raise UserError(f"expected exactly one of --spec, --spec-file and --suite, found {found}")
+    if flags.draw is not None and flags.draw.suffix not in (".png", ".svg"):
+        raise UserError(f"--draw {flags.draw}: expected a file that ends in .png or .svg")
     for name, low, high in (("episodes", 1, 1_000_000), ("seed", 0, 2**31 - 1), ("max_nodes", 2, 4096)):
         if not low <= getattr(flags, name) <= high:
             raise UserError(f"--{name.replace('_', '-')} is {getattr(flags, name)}, expected {low} to {high}")

@@ -139,6 +139,23 @@ PANELS = {
 }
 
 
+TRAJECTORIES = "walk-trajectories"
+"""The figure of trained agents' ways in Walk, which needs a run's checkpoint and not only its record."""
+TRAJECTORY_TASKS = (
+    "achieve a; achieve b",
+    "achieve e; (achieve d ensuring not a)",
+    "(achieve a or achieve e); (achieve c ensuring not b)",
+    "achieve d ensuring not e; (achieve b ensuring not a)",
+    "achieve e; (achieve d; achieve a or achieve a; achieve c)",
+    "achieve b ensuring not a; (achieve c; (achieve a ensuring not b))",
+)
+
+
+def trajectory_run(total_steps: int | None) -> Run:
+    """Whose checkpoint is drawn."""
+    return Run("walk", 1, Curve("ours", "hrlspec"), 0, total_steps or BUDGETS["walk"])
+
+
 def record_of(folder: Path) -> dict[str, Any] | None:
     """What is kept of a run folder, ``None`` while the run is not finished.
 

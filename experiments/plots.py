@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
@@ -171,6 +172,24 @@ def trajectory(episode: Episode, names: Sequence[str], file: Path) -> Path:
     ax.set_axis_off()
     figure.legend(loc="outside right center", title="sub-tasks", fontsize=9)
     figure.savefig(file, dpi=110, metadata={"Software": None})
+    return file
+
+
+def gallery(episodes: Sequence[Episode], names: Sequence[str], file: Path) -> Path:
+    """Several episodes side by side, as `trajectory` draws each; the file's ending says in which format."""
+    columns = min(len(episodes), 3)
+    rows = -(-len(episodes) // columns)
+    figure = Figure(figsize=(5 * columns, 5.2 * rows), layout="constrained")
+    axes: Any = figure.subplots(rows, columns, squeeze=False)
+    for ax in axes.flat:
+        ax.set_axis_off()
+    for ax, episode in zip(axes.flat, episodes, strict=False):
+        episode.stage.draw(ax, episode.positions, episode.legs(names))
+        title = "\n".join(textwrap.wrap(episode.formula, 60))
+        ax.set_title(f"{title}\n{episode.outcome}, {len(episode.assigned)} steps", fontsize=9)
+        ax.legend(loc="upper right", fontsize=7)
+    with rc_context({"svg.hashsalt": file.stem}):
+        figure.savefig(file, dpi=110, metadata={"Date": None} if file.suffix == ".svg" else {"Software": None})
     return file
 
 

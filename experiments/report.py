@@ -39,7 +39,7 @@ _RECIPES: tuple[Recipe, ...] = ("paper", "hrlspec")
 
 
 def write_report(panels: Sequence[Panel], records: Mapping[Run, Record], figures: Path, report: Path) -> Iterator[Path]:
-    """Draws every panel that has records, writes the page, and yields the files one by one.
+    """Draws the given panels as far as they have records, writes the page of all, and yields the files one by one.
 
     Args:
         panels: what to draw.
@@ -47,10 +47,11 @@ def write_report(panels: Sequence[Panel], records: Mapping[Run, Record], figures
         figures: folder for PNG and SVG.
         report: the page (Markdown).
     """
-    by_panel = {panel: found for panel in panels if (found := _of_panel(panel, records))}
+    by_panel = {panel: found for panel in PANELS.values() if (found := _of_panel(panel, records))}
     figures.mkdir(parents=True, exist_ok=True)
     for panel, found in by_panel.items():
-        yield from _draw(panel, found, figures / panel.name)
+        if panel in panels:
+            yield from _draw(panel, found, figures / panel.name)
     report.parent.mkdir(parents=True, exist_ok=True)
     report.write_text("\n".join(_page(by_panel, Path(os.path.relpath(figures, report.parent)))) + "\n")
     yield report

@@ -19,7 +19,18 @@ from rich.console import Console
 
 from experiments.command import parse_flags
 from experiments.errors import Interrupted, UserError, main_guard
-from experiments.panels import NUM_SEEDS, PANELS, Panel, Run, read_run, record_of, write_run
+from experiments.panels import (
+    NUM_SEEDS,
+    PANELS,
+    TRAJECTORIES,
+    TRAJECTORY_TASKS,
+    Panel,
+    Run,
+    read_run,
+    record_of,
+    trajectory_run,
+    write_run,
+)
 from experiments.progress import duration
 from experiments.run_folder import read_metrics
 from experiments.signals import polled_signals
@@ -34,7 +45,7 @@ class ReproduceFlags:
     """Runs what the paper's figures are made of, as far as it is missing, and draws them."""
 
     only: tuple[str, ...] = ()
-    """Panels, such as letter-set1 or walk-ablation; all if not given."""
+    """Figures, such as letter-set1, walk-ablation or walk-trajectories; all if not given."""
     recipes: tuple[str, ...] = ("paper", "hrlspec")
     """Whose curves."""
     seeds: int = NUM_SEEDS
@@ -68,24 +79,34 @@ def main(argv: Sequence[str] | None = None) -> None:
     console = Console(stderr=True)
     runs = _runs(panels, flags)
     missing = [run for run in runs if read_run(run, flags.out) is None]
+    shown, pictures = trajectory_run(flags.steps), [flags.out / f"{TRAJECTORIES}{end}" for end in (".png", ".svg")]
+    to_draw = [] if flags.only and TRAJECTORIES not in flags.only else [file for file in pictures if not file.exists()]
+    if to_draw and shown not in missing and record_of(flags.work / shown.name) is None:
+        runs, missing = [*runs, shown], [*missing, shown]
     console.print(f"{len(runs)} runs, {len(missing)} of them missing", highlight=False)
     if flags.dry_run:
         for run in missing:
             print(" ".join(_command(run, flags.work)[1:]))
         return
     _make(missing, flags, console)
+    for file in to_draw:
+        _draw_trajectories(flags.work / shown.name, file)
+        console.print(f"written: {file}", highlight=False)
     # The drawing library is an extra, and takes a second to load.
     from experiments.report import write_report
 
-    records = {run: record for run in runs if (record := read_run(run, flags.out)) is not None}
+    # The page is about all that is known, whatever was asked for now.
+    every = _runs(list(PANELS.values()), flags)
+    records = {run: record for run in every if (record := read_run(run, flags.out)) is not None}
     for file in write_report(panels, records, flags.out, flags.report):
         console.print(f"written: {file}", highlight=False)
 
 
 def _chosen(flags: ReproduceFlags) -> list[Panel]:
+    known = [*PANELS, TRAJECTORIES]
     for name in flags.only:
-        if name not in PANELS:
-            raise UserError(f"--only {name}: there is no such panel, expected some of: {', '.join(PANELS)}")
+        if name not in known:
+            raise UserError(f"--only {name}: there is no such figure, expected some of: {', '.join(known)}")
     for name, value in (("seeds", flags.seeds), ("steps", flags.steps), ("jobs", flags.jobs)):
         if value is not None and value < 1:
             raise UserError(f"--{name} is {value}, expected at least 1")
@@ -99,6 +120,15 @@ def _runs(panels: Sequence[Panel], flags: ReproduceFlags) -> list[Run]:
     """All runs of the panels, each once; a panel's seeds one after the other."""
     every = [run for panel in panels for run in panel.runs(flags.seeds, flags.steps)]
     return list({run.name: run for run in every if run.curve.recipe in flags.recipes}.values())
+
+
+def _draw_trajectories(folder: Path, file: Path) -> None:
+    """One episode of each of a few tasks, by a run's agent."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    tasks = folder / "trajectories.txt"
+    tasks.write_text("\n".join(TRAJECTORY_TASKS) + "\n")
+    draw = ["--run", str(folder), "--spec-file", str(tasks), "--draw", str(file), "--episodes", "6", "--json"]
+    subprocess.run([sys.executable, "-m", "experiments.evaluate", *draw], check=True, stdout=subprocess.DEVNULL)
 
 
 def _command(run: Run, work: Path) -> list[str]:

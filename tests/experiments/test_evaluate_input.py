@@ -29,6 +29,7 @@ BAD_FLAGS: list[tuple[Sequence[str], str]] = [
     (("--run", "foreign", "--suite", "dag"), "holds another state"),
     (("--run", "foreign", "--suite", "dag", "--step", "5"), "no checkpoint of step 5"),
     (("--run", "run", "--suite", "cats"), "unknown suite 'cats' of 'letter'"),
+    (("--run", "run", "--suite", "dag", "--draw", "way.gif"), "--draw way.gif: expected a file that ends in .png"),
     (("--run", "run", "--spec", ""), "found no formula"),
     (("--run", "run", "--spec", "achieve"), "line 1, column 8"),
     (("--run", "run", "--spec", "achieve a ;; b"), "column 12"),

@@ -14,12 +14,24 @@ from typing import Any
 import numpy as np
 import pytest
 
+import envs_jax
 from experiments import reproduce
 from experiments.claims import CLAIMS, Claim, Record, final_return, finding, mean_return, no_violations, steps_to_most
 from experiments.errors import Interrupted, UserError
 from experiments.options import experiments_of, parse_run
-from experiments.panels import BUDGETS, PANELS, Curve, Run, read_run, record_file, write_run
+from experiments.panels import (
+    BUDGETS,
+    PANELS,
+    TRAJECTORY_TASKS,
+    Curve,
+    Run,
+    read_run,
+    record_file,
+    trajectory_run,
+    write_run,
+)
 from experiments.report import write_report
+from hrlspec import compile, parse
 from tests.experiments.tiny import arguments
 
 
@@ -56,6 +68,13 @@ def test_every_run_is_one_that_can_be_made_and_has_a_name_of_its_own() -> None:
     configs = [experiments_of(parse_run(run.flags))[0][0].config for run in (plain, no_max, no_shield)]
     assert [config.max_operator for config in configs] == [True, False, True]
     assert [config.shield.mode != "off" for config in configs] == [True, True, False]
+
+
+def test_the_tasks_of_the_trajectories_are_tasks() -> None:
+    names = envs_jax.make("walk").propositions
+    trees = [compile(parse(text), names, max_nodes=16) for text in TRAJECTORY_TASKS]
+    assert len({int(tree.depth.max()) for tree in trees}) > 1
+    assert trajectory_run(None) in PANELS["walk-set1"].runs(1, None)
 
 
 def test_records_are_kept_for_the_steps_they_were_asked_for(tmp_path: Path) -> None:
@@ -121,7 +140,7 @@ def test_the_report_is_drawn_from_records_alone_and_always_the_same(tmp_path: Pa
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        ("--only letter-set3", "there is no such panel, expected some of: letter-set1, walk-set1"),
+        ("--only letter-set3", "there is no such figure, expected some of: letter-set1, walk-set1"),
         ("--seeds 0", "--seeds is 0"),
         ("--steps -1", "--steps is -1"),
         ("--jobs 0", "--jobs is 0"),
