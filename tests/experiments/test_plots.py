@@ -57,6 +57,16 @@ def test_a_trajectory_names_its_subtasks(episode: Episode, tmp_path: Path, monke
     assert circles == [(0, 3), (2, 3)]  # column, row of a and of b
 
 
+@pytest.mark.parametrize("number", [1, 4])
+def test_a_gallery_holds_every_episode(number: int, episode: Episode, tmp_path: Path) -> None:
+    with Image.open(plots.gallery([episode] * number, NAMES, tmp_path / "g.png")) as image:
+        assert image.width > min(number, 3) * 400
+        assert image.height > -(-number // 3) * 400
+    drawn = [plots.gallery([episode] * number, NAMES, tmp_path / "g.svg").read_bytes() for _ in range(2)]
+    assert drawn[0] == drawn[1]
+    assert drawn[0].startswith(b"<?xml")
+
+
 def test_a_task_graph(episode: Episode, tmp_path: Path) -> None:
     with Image.open(plots.task_graph(episode, NAMES, tmp_path / "g.png")) as image:
         assert min(image.size) > 100
