@@ -113,6 +113,7 @@ class Reflections:
         signs: their signs, K by F0.
         actions: signs of the A coordinates of an action, K by A.
         sector: L weights, largest for features that lie in the sector which is to hold the goal.
+        heading: F0 weights of shared features, for what is to stay as it is while the agent moves.
     """
 
     features: tuple[tuple[int, ...], ...]
@@ -120,6 +121,7 @@ class Reflections:
     signs: tuple[tuple[float, ...], ...]
     actions: tuple[tuple[float, ...], ...]
     sector: tuple[float, ...]
+    heading: tuple[float, ...]
 
 
 class Environment(abc.ABC):

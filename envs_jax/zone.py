@@ -173,6 +173,8 @@ class Zone(Environment):
             signs=_tuples(signs),
             actions=_tuples(actions),
             sector=tuple((np.cos(bearing) + 0.3 * np.sin(bearing)).tolist()),
+            # Whichever way it drives is forward; where that changed with the bearing alone, it could dither for ever.
+            heading=tuple(4.0 * (i == 3) for i in range(NUM_SENSORS + rest)),
         )
 
     @property

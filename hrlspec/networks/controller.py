@@ -70,7 +70,7 @@ def turn(planes: jax.Array, symmetries: Symmetries, lookahead: int) -> tuple[jax
 def reflect(
     planes: jax.Array, shared: jax.Array, reflections: Reflections, lookahead: int
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Reflects vectors by role so that what comes after the goal, or else the goal, lies in the sector.
+    """Reflects vectors by role so that the agent moves forward, and at rest towards what comes after the goal.
 
     Were it the goal first, the nearest of its instances would nearly always be right; see `sector_weights`.
 
@@ -87,7 +87,8 @@ def reflect(
     # Weights of the features as they are, one row for each reflection.
     weights = np.array(reflections.sector, np.float32)[np.argsort(orders)]
     after = planes[2] if lookahead else jnp.zeros_like(planes[0])
-    best = jnp.argmax(weights @ (0.05 * planes[0] + after))
+    moves = np.array(reflections.signs, np.float32) * np.array(reflections.heading, np.float32)
+    best = jnp.argmax(weights @ (0.05 * planes[0] + after) + (shared[np.array(reflections.shared)] * moves).sum(-1))
 
     def chosen(rows: Any) -> jax.Array:
         return jnp.asarray(np.array(rows))[best]
