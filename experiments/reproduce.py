@@ -88,7 +88,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         for run in missing:
             print(" ".join(_command(run, flags.work)[1:]))
         return
-    _make(missing, flags, console)
+    if missing:
+        _make(missing, flags, console)
     for file in to_draw:
         _draw_trajectories(flags.work / shown.name, file)
         console.print(f"written: {file}", highlight=False)

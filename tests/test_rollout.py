@@ -57,7 +57,7 @@ def prepare(params: Any, bank: TaskTree, key: jax.Array) -> tuple[TaskBook, Coll
     worker = start(AGENT, machine(), layouts, jnp.arange(E), jax.random.split(key, E), book)
     worker, decision = decide(AGENT, params, book, worker, jnp.zeros((E, 8)))
     zeros = jnp.zeros(E, jnp.int32)
-    return book, Collector(worker=worker, decision=decision, level=zeros, started=zeros)
+    return book, Collector(worker=worker, decision=decision, level=zeros, started=zeros, since=zeros)
 
 
 @quick_jit
@@ -190,6 +190,7 @@ def test_decisions_where_they_are_due_and_only_there() -> None:
             due[s, e] = ended or both.edge_taken[s - 1, e] or lost
             if not due[s, e]:
                 assert both.assigned[s, e] == both.assigned[s - 1, e]
+            assert both.since[s, e] == (0 if due[s, e] else both.since[s - 1, e] + 1)
     np.testing.assert_array_equal(both.decided, due)
     assert 0.1 < due.mean() < 0.9
 
