@@ -1,4 +1,4 @@
-"""``python -m experiments.demo rooms|dilemma``: the paper's two motivating examples, learned and drawn in minutes.
+"""``python -m experiments.demo rooms|dilemma``: the paper's two motivating examples, trained on and drawn.
 
 ``rooms``: red ball, then blue ball, behind a door whose key lies at the start. Who thinks of one sub-task at a time
 comes back for the key. ``dilemma``: reaching a completes the task, and closes off c, which pays ten times as much.
