@@ -17,6 +17,8 @@ from hrlspec.spec import TaskState, TaskTree, open_edges
 FADING = 0.98
 """What is left of a measurement's weight an iteration later: options change while they are learned."""
 
+_LEAST = 1e-9
+
 
 @struct.dataclass
 class Measurements:
@@ -94,8 +96,9 @@ def values(known: Measurements, tree: TaskTree, state: TaskState) -> jax.Array:
     ``Q(q, e) = D_e (R_e + max_e' Q(q', e'))`` with the measured E[γ^duration] D_e and reward R_e; -inf on other nodes.
     A conjunction takes as long as the longest of its goals.
     """
-    per_attempt = known.discounted / known.attempts
-    per_success = known.rewards / jnp.maximum(known.successes, 1e-6)
+    # What was never tried keeps its first guess, also when that has faded to nothing.
+    per_attempt = (known.discounted + _LEAST) / (known.attempts + _LEAST)
+    per_success = known.rewards / (known.successes + _LEAST)
     origin = origins(tree)[tree.parent].astype(jnp.float32)
     origin = origin / jnp.maximum(origin.sum(-1, keepdims=True), 1.0)
     reach = jnp.where(tree.reach, origin @ per_attempt, jnp.inf).min(-1)

@@ -140,6 +140,13 @@ def test_logic_value_iteration() -> None:
         np.testing.assert_allclose(result, expected, rtol=1e-5)
 
 
+def test_what_was_never_tried_stays_worth_a_try() -> None:
+    """However long ago its only, imagined attempt was."""
+    faded = jax.tree.map(jnp.zeros_like, options.unmeasured(P))
+    tree = on_device(FIRST)
+    assert np.isfinite(np.asarray(options.values(faded, tree, initial(tree)))[1])
+
+
 def test_measurements_are_sums_over_attempts_that_fade() -> None:
     rng = np.random.default_rng(1)
     shape = (6, 3)
