@@ -53,7 +53,7 @@ class Rooms(Environment):
     2 left, 3 right; walls and the locked door let nobody through. Labels: in which ball's cell the agent is.
     """
 
-    horizon: int = 60
+    horizon: int = 150
     name: str = "rooms"
     propositions = ("blue", "red")
     action_space = Discrete(n=4)

@@ -152,9 +152,16 @@ def walk(config: Config) -> Config:
     return dataclasses.replace(
         config,
         total_steps=2_000_000,
+        # Half as many steps of collection, whose planner costs the same for twice the environments.
+        num_envs=256,
         discount=0.99,
         # White noise stays within a unit of the start, and the nearest region is three away.
-        noise_correlation=0.98,
+        noise_correlation=0.99,
+        # The farthest region is eighty steps away: with 0.95 one seed in five never learned the way.
+        low=dataclasses.replace(config.low, gae_lambda=0.98, minibatches=32),
+        network=dataclasses.replace(config.network, encoder_mlp=(64,), actor=(64, 64)),
+        # The first level knows one start alone.
+        curriculum=dataclasses.replace(config.curriculum, promotion=0.6),
         # Some ways between regions are rare: with a quarter of the environments success after 2 M steps was 0.87 once.
         relabel=dataclasses.replace(config.relabel, share=0.5),
     )
