@@ -7,6 +7,7 @@ comes back for the key. ``dilemma``: reaching a completes the task, and closes o
 from __future__ import annotations
 
 import dataclasses
+import functools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -59,15 +60,20 @@ class Demo:
         env: the world.
         task: what is asked for, a task like those of the curriculum.
         methods: who is trained.
-        machine: the rewards.
         steps: environment steps.
+        bonuses: what orders of propositions earn beyond the 1 for the task.
     """
 
     env: Any
     task: str
     methods: tuple[Method, ...]
-    machine: RewardMachine
     steps: int
+    bonuses: tuple[Bonus, ...] = ()
+
+    @functools.cached_property
+    def machine(self) -> RewardMachine:
+        """The rewards; made when asked for, since making them takes hold of the device."""
+        return reward_machine(self.env.propositions, bonuses=self.bonuses)
 
     def config(self, method: Method, steps: int) -> Config:
         """Settings of a method."""
@@ -91,13 +97,9 @@ class Demo:
 
 
 DEMOS = {
-    "rooms": Demo(Rooms(), ROOMS_TASK, ("ours", "option"), reward_machine(Rooms.propositions), 600_000),
+    "rooms": Demo(Rooms(), ROOMS_TASK, ("ours", "option"), 600_000),
     "dilemma": Demo(
-        DILEMMA,
-        DILEMMA_TASK,
-        ("ours", "option", "ltl2action"),
-        reward_machine(DILEMMA.propositions, bonuses=[Bonus("b", "c", 9.0)]),
-        1_500_000,
+        DILEMMA, DILEMMA_TASK, ("ours", "option", "ltl2action"), 1_500_000, bonuses=(Bonus("b", "c", 9.0),)
     ),
 }
 
