@@ -90,11 +90,16 @@ class Episode:
         ]
         legs = []
         for number, (first, end) in enumerate(zip(changes, [*changes[1:], len(self.assigned)], strict=True), 1):
-            edge = int(self.assigned[first])
+            completed = self.nodes[end] != self.nodes[end - 1]
+            # A flat policy is assigned nothing: what it completed was its sub-task, whatever it meant to do.
+            edge = int(self.assigned[first]) or int(completed * self.nodes[end])
+            if edge == TaskTree.ROOT:
+                legs.append(Leg(first, end - 1, f"{number}. what remains", (), (), False))
+                continue
             (found,) = [x for x in subtasks(self.tree, int(self.tree.parent[edge]), names) if x.node == edge]
             reach, avoid = (tuple(str(name) for name in some) for some in (found.reach, found.avoid))
             label = f"{number}. {' and '.join(reach)}" + (f", avoiding {' '.join(avoid)}" if avoid else "")
-            legs.append(Leg(first, end - 1, label, reach, avoid, bool(self.nodes[end] != self.nodes[end - 1])))
+            legs.append(Leg(first, end - 1, label, reach, avoid, bool(completed)))
         return legs
 
     @property
