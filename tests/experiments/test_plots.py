@@ -41,9 +41,10 @@ def episode() -> Episode:
 
 def test_a_flat_policy_is_shown_by_what_it_completed(episode: Episode) -> None:
     flat = dataclasses.replace(episode, assigned=np.zeros(4, int))
-    assert [leg.label for leg in flat.legs(NAMES)] == ["1. a", "2. b, avoiding d"]
+    assert [leg.label for leg in flat.legs(NAMES)] == ["1. a, avoiding c", "2. b, avoiding d"]
     unfinished = dataclasses.replace(flat, nodes=np.array([0, 0, 1, 1, 1]), success=False)
-    assert [(leg.label, leg.reached) for leg in unfinished.legs(NAMES)] == [("1. a", True), ("2. what remains", False)]
+    expected = [("1. a, avoiding c", True), ("2. what remains", False)]
+    assert [(leg.label, leg.reached) for leg in unfinished.legs(NAMES)] == expected
 
 
 def test_a_trajectory_names_its_subtasks(episode: Episode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
