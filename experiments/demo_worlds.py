@@ -152,6 +152,7 @@ DILEMMA = Walk(
     discs=(("a", 2.2, 1.0, 0.7), ("b", 4.6, 2.2, 0.7), ("c", 7.6, 2.4, 0.7), ("d", 6.2, 0.9, 0.7)),
     low=-1.0,
     high=9.0,
+    step_size=0.2,
     horizon=200,
     name="dilemma",
 )
