@@ -121,3 +121,11 @@ def test_thinking_ahead_fetches_the_key_first() -> None:
     each = [jax.tree.map(lambda x, i=i: x[i], shown.layouts) for i in range(demo.LAYOUTS)]
     assert steps["ours"] < 1.05 * np.mean([fewest_steps(x, key_first=True) for x in each])
     assert steps["option"] > 0.95 * np.mean([fewest_steps(x, key_first=False) for x in each])
+
+
+@pytest.mark.slow
+def test_what_closes_off_a_better_goal_is_left_alone() -> None:
+    """All episodes of ours go past a to b and c, for 10 instead of 1."""
+    dilemma = demo.DEMOS["dilemma"]
+    shown = demo.act(dilemma, demo.train(dilemma, "ours", dilemma.steps, 0), 0)
+    assert (shown.episodes.returns == 10).all()
