@@ -112,8 +112,8 @@ class Reflections:
         shared: K orders of the F0 shared features.
         signs: their signs, K by F0.
         actions: signs of the A coordinates of an action, K by A.
-        sector: L weights, largest for features that lie in the sector which is to hold the goal.
-        heading: F0 weights of shared features, for what is to stay as it is while the agent moves.
+        sector: L weights, largest for features that lie in the sector which is to hold what the agent is turned to.
+        heading: F0 weights of shared features, large where the agent moves the way that is to count as forward.
     """
 
     features: tuple[tuple[int, ...], ...]
