@@ -97,7 +97,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     from experiments.report import write_report
 
     # The page is about all that is known, whatever was asked for now.
-    every = _runs(list(PANELS.values()), flags)
+    known = dataclasses.replace(flags, recipes=("paper", "hrlspec"), seeds=max(flags.seeds, NUM_SEEDS))
+    every = _runs(list(PANELS.values()), known)
     records = {run: record for run in every if (record := read_run(run, flags.out)) is not None}
     for file in write_report(panels, records, flags.out, flags.report):
         console.print(f"written: {file}", highlight=False)

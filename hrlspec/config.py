@@ -46,7 +46,8 @@ class NetworkConfig:
     role in the task."""
     symmetric: bool = False
     """Whether the low level sees the world in one of its turned or reflected forms alone: its goal in one sector, or,
-    where vectors are reflected, its own motion forward; in environments that say how, seen by role. What is learned in one direction is then known in all."""
+    where vectors are reflected, its own motion forward; in environments that say how, seen by role. What is
+    learned in one direction is then known in all."""
     lookahead: int = 2
     """How many later sub-tasks have a role of their own."""
     whole_task: bool = False
