@@ -182,7 +182,7 @@ def main(script: str, env: str, flags: CommonFlags, measure: Callable[[], Mappin
         flags: what to measure.
         measure: the entries about the environment alone.
     """
-    prepare(env)
+    prepare(env, "hrlspec" if "hrlspec" in flags.recipes else "paper")
     if flags.only_start:
         print(json.dumps(start(env, flags.recipes[0])))
         return

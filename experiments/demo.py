@@ -122,7 +122,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     steps = demo.steps if flags.steps is None else flags.steps
     if steps < 1:
         raise UserError(f"--steps is {steps}, expected at least 1")
-    platform.prepare("letter")
+    platform.prepare("letter", "hrlspec")
     shown = {method: act(demo, train(demo, method, steps, flags.seed), flags.seed) for method in demo.methods}
     result_console().print(table(demo, shown))
     flags.out.mkdir(parents=True, exist_ok=True)

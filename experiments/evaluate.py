@@ -81,7 +81,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     _check(flags)
     experiment = experiment_of(read_record(flags.run)["config"], str(flags.run))
     suite = tasks_of(flags, experiment)
-    platform.prepare(experiment.env)
+    platform.prepare(experiment.env, experiment.recipe)
     agent = Agent(environment_of(experiment), experiment.config)
     params, step = load_params(agent, flags.run, flags.step)
     try:

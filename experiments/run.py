@@ -39,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     flags = parse_run(sys.argv[1:] if argv is None else argv)
     runs = experiments_of(flags)
     resumed = _check_folders(runs, flags)
-    platform.prepare(flags.env)
+    platform.prepare(flags.env, flags.recipe)
     console = result_console()
     summaries = [
         _run(experiment, folder, resume, flags, console)

@@ -68,8 +68,8 @@ class PPOConfig:
 
     learning_rate: float = 1e-3
     final_learning_rate: float = 0.0
-    epochs: int = 3
-    minibatches: int = 8
+    epochs: int = 2
+    minibatches: int = 16
     clip: float = 0.2
     most_ratio: float = math.exp(10.0)
     """Largest probability ratio that counts where the advantage is negative; 1.0 + ``clip`` or more."""
@@ -178,7 +178,7 @@ class Config:
     group: int = 32
     """Environments the planner decides for at a time."""
     low: PPOConfig = PPOConfig()
-    high: PPOConfig = PPOConfig(learning_rate=5e-4, epochs=2, minibatches=2, entropy=0.005, final_entropy=0.005)
+    high: PPOConfig = PPOConfig(learning_rate=5e-4, epochs=1, minibatches=8, entropy=0.005, final_entropy=0.005)
     network: NetworkConfig = NetworkConfig()
     curriculum: CurriculumConfig = CurriculumConfig()
     relabel: RelabelConfig = RelabelConfig()

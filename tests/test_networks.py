@@ -17,7 +17,7 @@ import pytest
 import envs_jax
 from hrlspec.agent import Agent
 from hrlspec.networks.controller import TURNS, Instruction, turned
-from hrlspec.networks.encoder import patches
+from hrlspec.networks.encoder import convolve
 from hrlspec.networks.planner import MASKED
 from hrlspec.spec import TaskState, TaskTree, initial, open_edges
 from tests.probes import (
@@ -229,16 +229,37 @@ def test_gradients_are_finite(rounds: int, extras: bool) -> None:
     assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(gradient["reach_critic"]))
 
 
-def test_patches_are_the_2x2_convolutions_inputs() -> None:
+def convolution(image: np.ndarray, weights: np.ndarray, bias: np.ndarray) -> np.ndarray:
+    """A 2x2 convolution with ReLU, place by place; images are ``[C, H, W]``."""
+    channels, height, width = image.shape
+    # The weights' rows come corner by corner: (0, 0), (1, 0), (0, 1), (1, 1).
+    kernel = weights.reshape(2, 2, channels, -1)
+    result = np.zeros((weights.shape[1], height - 1, width - 1))
+    for row, column in np.ndindex(height - 1, width - 1):
+        patch = image[:, row : row + 2, column : column + 2].transpose(2, 1, 0)
+        result[:, row, column] = np.tensordot(patch, kernel, 3) + bias
+    return np.maximum(result, 0.0)
+
+
+def test_convolutions_and_their_batches() -> None:
+    """Against a convolution written out; with many images, many networks, and both."""
     rng = np.random.default_rng(0)
-    image, kernel = rng.normal(size=(5, 6, 3)).astype(np.float32), rng.normal(size=(2, 2, 3, 7)).astype(np.float32)
-    expected = np.zeros((4, 5, 7))
-    for row in range(4):
-        for column in range(5):
-            expected[row, column] = np.tensordot(image[row : row + 2, column : column + 2], kernel, 3)
-    # Patches come in the order (0, 0), (1, 0), (0, 1), (1, 1).
-    flat = kernel.transpose(1, 0, 2, 3).reshape(12, 7)
-    np.testing.assert_allclose(patches(jnp.asarray(image)) @ flat, expected, rtol=1e-4, atol=1e-5)
+    shapes = ((12, 7), (28, 5))
+    nets = [[(rng.normal(size=shape), rng.normal(size=shape[1:])) for shape in shapes] for _ in range(2)]
+    images = rng.normal(size=(4, 3, 5, 6))
+    expected = np.zeros((2, 4, 5 * 3 * 4))
+    for which, image in np.ndindex(2, 4):
+        x = images[image]
+        for layer in nets[which]:
+            x = convolution(x, *layer)
+        expected[which, image] = x.reshape(-1)
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *nets)
+    single = [[convolve(image, net) for image in jnp.asarray(images)] for net in jax.tree.map(jnp.asarray, nets)]
+    over_images = [jax.vmap(convolve, in_axes=(0, None))(images, net) for net in nets]
+    over_nets = jnp.stack([jax.vmap(convolve, in_axes=(None, 0))(image, stacked) for image in images], axis=1)
+    over_both = jax.vmap(jax.vmap(convolve, in_axes=(0, None)), in_axes=(None, 0))(images, stacked)
+    for name, found in {"one": single, "images": over_images, "nets": over_nets, "both": over_both}.items():
+        np.testing.assert_allclose(np.asarray(found), expected, rtol=1e-4, atol=1e-4, err_msg=name)
 
 
 def test_the_reach_critic_answers_in_the_unit_interval_for_each_goal() -> None:

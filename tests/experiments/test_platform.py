@@ -49,7 +49,7 @@ import os, sys
 from experiments import platform
 import jax
 before = dict(os.environ)
-platform.prepare(sys.argv[1])
+platform.prepare(*sys.argv[1:])
 import jax.numpy as jnp
 assert float(jax.jit(lambda x: x + 1)(jnp.ones(()))) == 2  # XLA knows the flags
 print(jax.config.jax_compilation_cache_dir)
@@ -58,11 +58,11 @@ print(os.environ["XLA_FLAGS"])
 """
 
 
-def prepared(env: str = "letter", **environment: str) -> list[str]:
+def prepared(env: str = "letter", recipe: str = "hrlspec", **environment: str) -> list[str]:
     names = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "XLA_FLAGS")
     clean = {name: value for name, value in os.environ.items() if name not in names}
     ended = subprocess.run(
-        [sys.executable, "-c", SCRIPT, env],
+        [sys.executable, "-c", SCRIPT, env, recipe],
         cwd=ROOT,
         env=clean | environment,
         capture_output=True,
@@ -82,8 +82,9 @@ def test_the_cache_belongs_to_user_and_version(tmp_path: Path) -> None:
     assert flags == compiled_quickly(with_loop_option("", jax.__version_info__))
 
 
-def test_physics_is_optimised_in_full() -> None:
-    *_, flags = prepared("zone-nm", JAX_PLATFORMS="cpu")
+@pytest.mark.parametrize(("env", "recipe"), [("zone-nm", "hrlspec"), ("walk", "paper")])
+def test_what_gains_from_it_is_optimised_in_full(env: str, recipe: str) -> None:
+    *_, flags = prepared(env, recipe, JAX_PLATFORMS="cpu")
     assert "optimization_level" not in flags
 
 
