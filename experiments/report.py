@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 
 from experiments.claims import (
     CLAIMS,
-    FEWEST_SEEDS,
     Record,
     Records,
     final_return,
@@ -24,7 +23,7 @@ from experiments.claims import (
     steps_to_most,
 )
 from experiments.options import Recipe
-from experiments.panels import PANELS, Curve, Panel, Run
+from experiments.panels import PANELS, TRAJECTORIES, Curve, Panel, Run
 from experiments.progress import duration
 from hrlspec.stats import mean_interval
 
@@ -36,6 +35,8 @@ curves), actions sampled, no shield. Figures are interquartile means over seeds 
 No-ER, relabelling. Recipe `paper` collects with the shield, also for Option; LTL2Action has no sub-task and so nothing
 to shield. Recipe `hrlspec` has no shield."""
 _RECIPES: tuple[Recipe, ...] = ("paper", "hrlspec")
+_FEWEST_FOR_BAND = 3
+"""Student's t interval of two seeds is twelve times as wide as what they differ by."""
 
 
 def write_report(panels: Sequence[Panel], records: Mapping[Run, Record], figures: Path, report: Path) -> Iterator[Path]:
@@ -53,7 +54,7 @@ def write_report(panels: Sequence[Panel], records: Mapping[Run, Record], figures
         if panel in panels:
             yield from _draw(panel, found, figures / panel.name)
     report.parent.mkdir(parents=True, exist_ok=True)
-    report.write_text("\n".join(_page(by_panel, Path(os.path.relpath(figures, report.parent)))) + "\n")
+    report.write_text("\n".join(_page(by_panel, Path(os.path.relpath(figures, report.parent)), report)) + "\n")
     yield report
 
 
@@ -94,12 +95,12 @@ def _band(ax: Axes, label: str, records: Sequence[Record]) -> None:
     returns = np.array([[row["eval/return_mean"] for row in record["rows"][:length]] for record in records])
     intervals = [mean_interval(column) for column in returns.T]
     (line,) = ax.plot(steps, [interval.estimate for interval in intervals], label=f"{label} ({len(records)})")
-    if len(records) >= FEWEST_SEEDS:
+    if len(records) >= _FEWEST_FOR_BAND:
         low, high = ([getattr(interval, end) for interval in intervals] for end in ("low", "high"))
         ax.fill_between(steps, low, high, alpha=0.2, color=line.get_color(), linewidth=0)
 
 
-def _page(by_panel: Mapping[Panel, Records], figures: Path) -> Iterator[str]:
+def _page(by_panel: Mapping[Panel, Records], figures: Path, report: Path) -> Iterator[str]:
     yield "# Results"
     yield ""
     yield _ABOUT
@@ -123,9 +124,21 @@ def _page(by_panel: Mapping[Panel, Records], figures: Path) -> Iterator[str]:
         yield ""
         yield f"![{panel.title}]({(figures / panel.name).as_posix()}.png)"
         yield ""
-        yield "| curve | seeds | final return | success | mean of the curve | steps to 90 % of it | ratio | training |"
-        yield "|---|---|---|---|---|---|---|---|"
+        columns = ("curve", "seeds", "final return", "success", "SPL", "contested", "mean of the curve")
+        yield f"| {' | '.join(columns)} | steps to 90 % of it | ratio | training |"
+        yield "|---" * (len(columns) + 3) + "|"
         yield from _rows(records)
+        yield ""
+        seconds = sum(record["wall_s"] for some in records.values() for record in some)
+        runs = sum(map(len, records.values()))
+        yield f"These {runs} runs took {duration(seconds)} of training, one after the other."
+    if (report.parent / figures / f"{TRAJECTORIES}.png").exists():
+        yield ""
+        yield "## Walk, trajectories"
+        yield ""
+        yield "A trained agent (recipe hrlspec, seed 0) on six tasks; reached is outlined, avoided is hatched."
+        yield ""
+        yield f"![Trajectories]({(figures / TRAJECTORIES).as_posix()}.png)"
 
 
 def _rows(records: Records) -> Iterator[str]:
@@ -135,7 +148,11 @@ def _rows(records: Records) -> Iterator[str]:
     for curve, some in records.items():
         steps = over_seeds(steps_to_most, some).estimate
         ratio = f"{fastest[curve.recipe] / steps:.2f}" if curve.recipe in fastest else ""
-        success = np.mean([record["final"]["suite"]["success_rate"] for record in some])
+        suites = [record["final"]["suite"] for record in some]
+        success, spl = (np.mean([suite[name] for suite in suites]) for name in ("success_rate", "spl"))
+        contested = [record["final"].get("contested_choice") for record in some]
+        choice = f"{np.mean([one['contested_choice'] for one in contested]):.3f}" if all(contested) else ""
         wall = duration(float(np.mean([record["wall_s"] for record in some])))
-        figures = f"{over_seeds(final_return, some)} | {success:.3f} | {over_seeds(mean_return, some)}"
-        yield f"| {curve.label} | {len(some)} | {figures} | {steps:,.0f} | {ratio} | {wall} |"
+        final = f"{over_seeds(final_return, some)} | {success:.3f} | {spl:.3f} | {choice}"
+        learning = f"{over_seeds(mean_return, some)} | {steps:,.0f} | {ratio} | {wall}"
+        yield f"| {curve.label} | {len(some)} | {final} | {learning} |"

@@ -12,7 +12,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -143,7 +143,7 @@ def _make(missing: Sequence[Run], flags: ReproduceFlags, console: Console) -> No
     """Makes the missing runs, several side by side, and keeps the record of each as soon as it is finished."""
     waiting, failed = list(missing), list[Run]()
     free = _places(flags.jobs)
-    running: dict[Run, tuple[subprocess.Popen[bytes], dict[str, str]]] = {}
+    running: dict[Run, tuple[subprocess.Popen[bytes], _Place]] = {}
     meter = _Meter(missing, flags.work, console)
     with polled_signals() as stop, contextlib.ExitStack() as processes:
         processes.callback(_end, running)
@@ -170,28 +170,49 @@ def _make(missing: Sequence[Run], flags: ReproduceFlags, console: Console) -> No
         raise UserError(f"{len(failed)} runs failed, the first is {failed[0].name}; the same command tries again")
 
 
-def _places(jobs: int | None) -> list[dict[str, str]]:
-    """What to add to the surroundings of each of the runs side by side: one accelerator each, where there are some."""
+@dataclasses.dataclass(frozen=True)
+class _Place:
+    """Where one of the runs side by side takes place.
+
+    Attributes:
+        variables: added to its environment variables.
+        cores: it keeps to these, or two runs would wait for each other's threads; none: it is free.
+    """
+
+    variables: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    cores: Sequence[int] = ()
+
+
+def _places(jobs: int | None) -> list[_Place]:
+    """An accelerator for each of the runs side by side, or else its share of the cores."""
     if jobs is None or jobs > 1:
         # Asked in another process, since asking takes hold of the devices.
         code = "import jax; print(jax.default_backend(), jax.device_count())"
         said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False).stdout.split()
         if len(said) == 2 and said[0] == "gpu":
             count = int(said[1])
-            return [{"CUDA_VISIBLE_DEVICES": str(i % count)} for i in range(jobs or count)]
-    return [{} for _ in range(jobs or os.cpu_count() or 1)]
+            return [_Place({"CUDA_VISIBLE_DEVICES": str(i % count)}) for i in range(jobs or count)]
+    if not hasattr(os, "sched_getaffinity"):  # other systems than Linux
+        return [_Place() for _ in range(jobs or os.cpu_count() or 1)]
+    cores = sorted(os.sched_getaffinity(0))
+    jobs = jobs or len(cores)
+    return [_Place(cores=cores[i % len(cores) :: jobs]) for i in range(jobs)]
 
 
-def _start(run: Run, work: Path, place: dict[str, str]) -> subprocess.Popen[bytes]:
+def _start(run: Run, work: Path, place: _Place) -> subprocess.Popen[bytes]:
     work.mkdir(parents=True, exist_ok=True)
     with (work / f"{run.name}.log").open("ab") as log:
         # A process group of its own: Ctrl-C reaches this process alone, which then asks the others to stop.
-        return subprocess.Popen(
-            _command(run, work), stdout=log, stderr=log, env=os.environ | place, start_new_session=True
+        process = subprocess.Popen(
+            _command(run, work), stdout=log, stderr=log, env=os.environ | place.variables, start_new_session=True
         )
+    if place.cores:
+        with contextlib.suppress(ProcessLookupError):  # it has failed already
+            os.sched_setaffinity(process.pid, place.cores)
+    return process
 
 
-def _end(running: dict[Run, tuple[subprocess.Popen[bytes], dict[str, str]]]) -> None:
+def _end(running: Mapping[Run, tuple[subprocess.Popen[bytes], _Place]]) -> None:
     """Asks what is still running to save and stop, and waits for it."""
     for process, _ in running.values():
         process.terminate()

@@ -41,7 +41,8 @@ def record(curve: list[float], final: float, violations: float = 0.0) -> dict[st
         {"env_steps": 100 * (i + 1), "eval/return_mean": value, "train/violations": violations}
         for i, value in enumerate(curve)
     ]
-    return {"wall_s": 60.0, "rows": rows, "final": {"suite": {"return_mean": final, "success_rate": final}}}
+    suite = {"return_mean": final, "success_rate": final, "spl": final}
+    return {"wall_s": 60.0, "rows": rows, "final": {"suite": suite, "contested_choice": {"contested_choice": final}}}
 
 
 def test_there_are_nine_panels_of_the_paper_and_one_of_techniques() -> None:
@@ -132,7 +133,8 @@ def test_the_report_is_drawn_from_records_alone_and_always_the_same(tmp_path: Pa
     assert contents[0] == contents[1]
     page = contents[0][2].decode()
     assert "](../figures/letter-techniques.png)" in page
-    assert "| ours without max operator (paper) | 3 | 0.600" in page
+    assert "| ours without max operator (paper) | 3 | 0.600 [0.500, 0.700] | 0.600 | 0.600 | 0.600 |" in page
+    assert "These 9 runs took 9:00 of training" in page
     assert "| The max operator helps | letter-techniques | paper | 0.500" in page
     assert "walk-set1" not in page
 
@@ -153,6 +155,20 @@ def test_bad_input(flags: str, message: str, tmp_path: Path, monkeypatch: pytest
     with pytest.raises(UserError, match=message):
         reproduce.main(flags.split())
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="runs are free where cores cannot be chosen")
+def test_runs_side_by_side_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {2, 3, 5, 7})
+    monkeypatch.setattr(subprocess, "run", lambda *args, **kwargs: subprocess.CompletedProcess(args, 0, "cpu 1", ""))
+    shares = {jobs: [list(place.cores) for place in reproduce._places(jobs)] for jobs in (None, 1, 2, 3, 6)}
+    assert shares[None] == [[2], [3], [5], [7]]
+    assert shares[1] == [[2, 3, 5, 7]]
+    assert shares[2] == [[2, 5], [3, 7]]
+    assert shares[3] == [[2, 7], [3], [5]]
+    assert shares[6] == [[2], [3], [5], [7], [2], [3]]
+    monkeypatch.setattr(subprocess, "run", lambda *args, **kwargs: subprocess.CompletedProcess(args, 0, "gpu 2", ""))
+    assert [place.variables for place in reproduce._places(3)] == [{"CUDA_VISIBLE_DEVICES": n} for n in "010"]
 
 
 def test_a_dry_run_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
