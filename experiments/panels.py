@@ -30,7 +30,7 @@ class Curve:
     Attributes:
         method: who is trained.
         recipe: with which settings.
-        switches: flags of ``experiments.run`` that switch techniques off.
+        switches: further flags of ``experiments.run``: ``--no-`` and a technique, or ``--config.low.FIELD=VALUE``.
     """
 
     method: Method
@@ -39,9 +39,10 @@ class Curve:
 
     @property
     def label(self) -> str:
-        """Such as ``ours (paper)``, ``ours without shield (paper)``."""
-        without = "".join(f" without {switch.removeprefix('--no-').replace('-', ' ')}" for switch in self.switches)
-        return f"{self.method}{without} ({self.recipe})"
+        """Such as ``ours (paper)``, ``ours without shield (paper)``, ``ours learning rate 0.001 (paper)``."""
+        words = (switch.replace("--no-", "without ").removeprefix("--config.low.") for switch in self.switches)
+        parts = [self.method, *(word.replace("-", " ").replace("=", " ") for word in words)]
+        return f"{' '.join(parts)} ({self.recipe})"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +58,8 @@ class Run:
     @property
     def name(self) -> str:
         """Of its folder and record."""
-        switches = "".join(switch.removeprefix("-") for switch in self.curve.switches)
+        flags = (switch.removeprefix("--").removeprefix("config.low.") for switch in self.curve.switches)
+        switches = "".join(f"-{flag.replace('=', '-')}" for flag in flags)
         return f"{self.env}-{self.curve.method}-{self.curve.recipe}-set{self.reward_set}{switches}-seed{self.seed}"
 
     @property
@@ -86,6 +88,7 @@ class Panel:
         env: the environment.
         reward_set: the rewards.
         curves: the lines.
+        first_seed: of its runs.
     """
 
     name: str
@@ -93,11 +96,13 @@ class Panel:
     env: str
     reward_set: RewardSet
     curves: tuple[Curve, ...]
+    first_seed: int = 0
 
     def runs(self, num_seeds: int, total_steps: int | None) -> list[Run]:
         """Its runs, seed by seed, so that all lines grow alike."""
         steps = total_steps or BUDGETS[self.env]
-        return [Run(self.env, self.reward_set, curve, s, steps) for s in range(num_seeds) for curve in self.curves]
+        seeds = range(self.first_seed, self.first_seed + num_seeds)
+        return [Run(self.env, self.reward_set, curve, seed, steps) for seed in seeds for curve in self.curves]
 
 
 _RECIPES: tuple[Recipe, ...] = ("paper", "hrlspec")
@@ -138,6 +143,32 @@ PANELS = {
     )
 }
 
+
+TRIED = {
+    ("letter", "paper"): (5e-4, 1e-3, 2e-3),
+    ("letter", "hrlspec"): (3.5e-4, 7e-4, 1.4e-3),
+    ("walk", "paper"): (5e-4, 1e-3, 2e-3),
+    ("walk", "hrlspec"): (5e-4, 1e-3, 2e-3),
+    ("zone", "paper"): (3.5e-4, 7e-4, 1.4e-3),
+    ("zone", "hrlspec"): (3.5e-4, 7e-4, 1.4e-3),
+}
+"""Learning rates of the low level, the same for every method: half, once and twice what the recipe began with."""
+
+
+def _trials(env: str) -> tuple[Curve, ...]:
+    return tuple(
+        Curve(method, recipe, (f"--config.low.learning-rate={rate:g}",))
+        for recipe in _RECIPES
+        for method in _COMPARED
+        for rate in TRIED[env, recipe]
+    )
+
+
+TUNING = {
+    f"{env}-tuning": Panel(f"{env}-tuning", f"{env.capitalize()}, tuning", env, 2, _trials(env), first_seed=100)
+    for env in ENVIRONMENTS
+}
+"""What the learning rates in ``presets.py`` were chosen by: one run each, with a seed that no panel uses."""
 
 TRAJECTORIES = "walk-trajectories"
 """The figure of trained agents' ways in Walk, which needs a run's checkpoint and not only its record."""

@@ -173,8 +173,8 @@ def walk_with_bonuses(config: Config) -> Config:
     """Reward set 2 in Walk, where one pair of regions in ten pays a bonus: rare, and worth more than all the rest."""
     return dataclasses.replace(
         config,
-        # The critic must tell those pairs from all others in 2 M steps: its errors count a hundred times as much as with
-        # returns scaled by 5 and half the weight.
+        # The critic must tell those pairs from all others in 2 M steps: its errors count a hundred times as much as
+        # with returns scaled by 5 and half the weight.
         value_scale=1.0,
         low=dataclasses.replace(config.low, value_coefficient=2.0),
         # As sharp as in set 1, per unit of return.

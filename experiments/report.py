@@ -23,7 +23,7 @@ from experiments.claims import (
     steps_to_most,
 )
 from experiments.options import Recipe
-from experiments.panels import PANELS, TRAJECTORIES, Curve, Panel, Run
+from experiments.panels import PANELS, TRAJECTORIES, TUNING, Curve, Panel, Run
 from experiments.progress import duration
 from hrlspec.stats import mean_interval
 
@@ -48,13 +48,16 @@ def write_report(panels: Sequence[Panel], records: Mapping[Run, Record], figures
         figures: folder for PNG and SVG.
         report: the page (Markdown).
     """
-    by_panel = {panel: found for panel in PANELS.values() if (found := _of_panel(panel, records))}
+    by_panel, tuning = (
+        {panel: found for panel in some.values() if (found := _of_panel(panel, records))} for some in (PANELS, TUNING)
+    )
     figures.mkdir(parents=True, exist_ok=True)
     for panel, found in by_panel.items():
         if panel in panels:
             yield from _draw(panel, found, figures / panel.name)
     report.parent.mkdir(parents=True, exist_ok=True)
-    report.write_text("\n".join(_page(by_panel, Path(os.path.relpath(figures, report.parent)), report)) + "\n")
+    page = _page(by_panel, Path(os.path.relpath(figures, report.parent)), report)
+    report.write_text("\n".join([*page, *_tuning(tuning)]) + "\n")
     yield report
 
 
@@ -139,6 +142,22 @@ def _page(by_panel: Mapping[Panel, Records], figures: Path, report: Path) -> Ite
         yield "A trained agent (recipe hrlspec, seed 0) on six tasks; reached is outlined, avoided is hatched."
         yield ""
         yield f"![Trajectories]({(figures / TRAJECTORIES).as_posix()}.png)"
+
+
+def _tuning(trials: Mapping[Panel, Records]) -> Iterator[str]:
+    """What was tried for each method, and what came of it."""
+    if not trials:
+        return
+    yield ""
+    yield "## Tuning"
+    yield ""
+    yield "Every method had the same trials: one run for each learning rate of the low level, seed 100, reward set 2."
+    yield ""
+    yield "| environment | trial | mean of the curve | final return |"
+    yield "|---|---|---|---|"
+    for panel, records in trials.items():
+        for curve, (record,) in records.items():
+            yield f"| {panel.env} | {curve.label} | {mean_return(record):.3f} | {final_return(record):.3f} |"
 
 
 def _rows(records: Records) -> Iterator[str]:

@@ -24,6 +24,7 @@ from experiments.panels import (
     PANELS,
     TRAJECTORIES,
     TRAJECTORY_TASKS,
+    TUNING,
     Panel,
     Run,
     read_run,
@@ -45,11 +46,12 @@ class ReproduceFlags:
     """Runs what the paper's figures are made of, as far as it is missing, and draws them."""
 
     only: tuple[str, ...] = ()
-    """Figures, such as letter-set1, walk-ablation or walk-trajectories; all if not given."""
+    """Figures, such as letter-set1, walk-ablation or walk-trajectories, or walk-tuning and its like; all figures if not
+    given."""
     recipes: tuple[str, ...] = ("paper", "hrlspec")
     """Whose curves."""
     seeds: int = NUM_SEEDS
-    """Runs of each curve, seeds 0, 1, ..."""
+    """Runs of each curve, seeds 0, 1, ... One for tuning."""
     steps: int | None = None
     """Environment steps of each run; 1.5 M in Letter, 2 M in Walk and 4 M in Zone if not given."""
     jobs: int | None = None
@@ -98,14 +100,14 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     # The page is about all that is known, whatever was asked for now.
     known = dataclasses.replace(flags, recipes=("paper", "hrlspec"), seeds=max(flags.seeds, NUM_SEEDS))
-    every = _runs(list(PANELS.values()), known)
+    every = _runs([*PANELS.values(), *TUNING.values()], known)
     records = {run: record for run in every if (record := read_run(run, flags.out)) is not None}
     for file in write_report(panels, records, flags.out, flags.report):
         console.print(f"written: {file}", highlight=False)
 
 
 def _chosen(flags: ReproduceFlags) -> list[Panel]:
-    known = [*PANELS, TRAJECTORIES]
+    known = [*PANELS, *TUNING, TRAJECTORIES]
     for name in flags.only:
         if name not in known:
             raise UserError(f"--only {name}: there is no such figure, expected some of: {', '.join(known)}")
@@ -115,12 +117,14 @@ def _chosen(flags: ReproduceFlags) -> list[Panel]:
     for recipe in flags.recipes:
         if recipe not in ("paper", "hrlspec"):
             raise UserError(f"--recipes {recipe}: there is no such recipe, expected paper, hrlspec or both")
-    return [panel for name, panel in PANELS.items() if not flags.only or name in flags.only]
+    if not flags.only:
+        return list(PANELS.values())
+    return [panel for name, panel in (PANELS | TUNING).items() if name in flags.only]
 
 
 def _runs(panels: Sequence[Panel], flags: ReproduceFlags) -> list[Run]:
     """All runs of the panels, each once; a panel's seeds one after the other."""
-    every = [run for panel in panels for run in panel.runs(flags.seeds, flags.steps)]
+    every = [run for panel in panels for run in panel.runs(1 if panel.name in TUNING else flags.seeds, flags.steps)]
     return list({run.name: run for run in every if run.curve.recipe in flags.recipes}.values())
 
 

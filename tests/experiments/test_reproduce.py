@@ -23,6 +23,8 @@ from experiments.panels import (
     BUDGETS,
     PANELS,
     TRAJECTORY_TASKS,
+    TRIED,
+    TUNING,
     Curve,
     Run,
     read_run,
@@ -59,8 +61,8 @@ def test_there_are_nine_panels_of_the_paper_and_one_of_techniques() -> None:
 
 
 def test_every_run_is_one_that_can_be_made_and_has_a_name_of_its_own() -> None:
-    runs = {run for panel in PANELS.values() for run in panel.runs(1, None)}
-    assert len({run.name for run in runs}) == len(runs) == 50
+    runs = {run for panel in (PANELS | TUNING).values() for run in panel.runs(1, None)}
+    assert len({run.name for run in runs}) == len(runs) == 50 + 54
     for run in runs:
         ((experiment, _),) = experiments_of(parse_run(run.flags))
         assert (experiment.env, experiment.method, experiment.recipe) == (run.env, run.curve.method, run.curve.recipe)
@@ -69,6 +71,20 @@ def test_every_run_is_one_that_can_be_made_and_has_a_name_of_its_own() -> None:
     configs = [experiments_of(parse_run(run.flags))[0][0].config for run in (plain, no_max, no_shield)]
     assert [config.max_operator for config in configs] == [True, False, True]
     assert [config.shield.mode != "off" for config in configs] == [True, True, False]
+
+
+def test_every_method_is_tuned_alike() -> None:
+    for env, panel in zip(BUDGETS, TUNING.values(), strict=True):
+        runs = panel.runs(1, None)
+        tried: dict[tuple[str, str], list[float]] = {}
+        for run in runs:
+            ((experiment, _),) = experiments_of(parse_run(run.flags))
+            kind = (run.curve.recipe, run.curve.method)
+            tried.setdefault(kind, []).append(experiment.config.low.learning_rate)
+        assert len(tried) == 6
+        assert all(rates == list(TRIED[(env, recipe)]) for (recipe, _), rates in tried.items())
+        panels = [other for name, other in PANELS.items() if name.startswith(env)]
+        assert not {run.seed for run in runs} & {run.seed for other in panels for run in other.runs(5, None)}
 
 
 def test_the_tasks_of_the_trajectories_are_tasks() -> None:
@@ -137,6 +153,13 @@ def test_the_report_is_drawn_from_records_alone_and_always_the_same(tmp_path: Pa
     assert "These 9 runs took 9:00 of training" in page
     assert "| The max operator helps | letter-techniques | paper | 0.500" in page
     assert "walk-set1" not in page
+
+
+def test_the_report_tells_the_trials(tmp_path: Path) -> None:
+    panel = TUNING["zone-tuning"]
+    records = {run: record([0.5], 0.25) for run in panel.runs(1, None)[:2]}
+    (page,) = write_report([], records, tmp_path, tmp_path / "page.md")
+    assert "| zone | ours learning rate 0.0007 (paper) | 0.500 | 0.250 |" in page.read_text()
 
 
 @pytest.mark.parametrize(
