@@ -143,6 +143,8 @@ def _continuous(config: Config, learning_rate: float) -> Config:
         network=dataclasses.replace(config.network, encoder_mlp=(64, 64), critic=(64, 64)),
         # What is found by chance is learned as well, or goals found too rarely are forgotten before they are learned.
         relabel=dataclasses.replace(config.relabel, visits=True),
+        # Within six steps of a forbidden region, not one and a half; critics of small steps take longer to learn.
+        shield=dataclasses.replace(config.shield, discount=0.98, minibatches=32),
         # At first some goals are found rarely; waiting for the last of them would waste the others.
         curriculum=dataclasses.replace(config.curriculum, promotion=0.85, window=256),
     )

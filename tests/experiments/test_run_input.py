@@ -125,7 +125,14 @@ def test_help_shows_the_preset_of_the_chosen_recipe(capsys: pytest.CaptureFixtur
     assert "--no-shield" in out
 
 
-@pytest.mark.parametrize("env", ["letter", "letter12"])
+@pytest.mark.parametrize(("env", "steps"), [("letter", 1), ("walk", 6), ("zone", 6)])
+def test_how_near_the_shield_lets_one_come(env: str, steps: int) -> None:
+    """The reach critic's value k steps from a region is discount^(k - 1)."""
+    shield = preset(env, "paper", 1, "ours").shield
+    assert shield.discount ** (steps - 1) > shield.threshold > shield.discount**steps
+
+
+@pytest.mark.parametrize("env", ["letter", "letter12", "walk", "zone"])
 @pytest.mark.parametrize("recipe", ["paper", "hrlspec"])
 @pytest.mark.parametrize("method", ["ours", "ltl2action", "option", "myopic-low", "no-er"])
 def test_every_preset_is_accepted(env: str, recipe: str, method: str) -> None:
