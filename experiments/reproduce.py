@@ -64,6 +64,8 @@ class ReproduceFlags:
     """Run folders with their checkpoints."""
     dry_run: bool = False
     """Only say what would be run."""
+    draw_only: bool = False
+    """Only draw figures and write the page, from the records there are."""
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -90,11 +92,12 @@ def main(argv: Sequence[str] | None = None) -> None:
         for run in missing:
             print(" ".join(_command(run, flags.work)[1:]))
         return
-    if missing:
-        _make(missing, flags, console)
-    for file in to_draw:
-        _draw_trajectories(flags.work / shown.name, file)
-        console.print(f"written: {file}", highlight=False)
+    if not flags.draw_only:
+        if missing:
+            _make(missing, flags, console)
+        for file in to_draw:
+            _draw_trajectories(flags.work / shown.name, file)
+            console.print(f"written: {file}", highlight=False)
     # The drawing library is an extra, and takes a second to load.
     from experiments.report import write_report
 

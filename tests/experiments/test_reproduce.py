@@ -204,6 +204,15 @@ def test_a_dry_run_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFi
     assert not any("--method ours --recipe paper --reward-set 1 --seed 0" in line for line in lines)
 
 
+def test_what_is_there_can_be_drawn_without_what_is_missing(tmp_path: Path) -> None:
+    for run in PANELS["walk-set1"].runs(1, None)[:2]:
+        write_run(run, record([0.5], 0.5), tmp_path)
+    page = tmp_path / "page.md"
+    reproduce.main(["--draw-only", "--out", str(tmp_path), "--report", str(page), "--work", str(tmp_path / "work")])
+    assert "| ltl2action (paper) | 1 | 0.500" in page.read_text()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["page.md", "walk", "walk-set1.png", "walk-set1.svg"]
+
+
 def test_what_is_cut_goes_on_and_what_fails_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two real runs, tiny ones: stopped on the way, then ended by the same command; a third one that fails."""
     where = ["--out", str(tmp_path / "out"), "--work", str(tmp_path / "work"), "--report", str(tmp_path / "page.md")]
