@@ -75,9 +75,10 @@ def _draw(panel: Panel, records: Records, file: Path) -> Iterator[Path]:
     figure = Figure(figsize=(0.5 + 4.5 * len(recipes), 3.6), layout="constrained")
     axes: Any = figure.subplots(1, len(recipes), squeeze=False, sharey=True)
     for ax, recipe in zip(axes[0], recipes, strict=True):
-        for curve, some in records.items():
-            if curve.recipe == recipe:
-                _band(ax, curve.label.rpartition(" (")[0], some)
+        # A method has one colour, whatever else is there yet.
+        for colour, curve in enumerate(curve for curve in panel.curves if curve.recipe == recipe):
+            if curve in records:
+                _band(ax, f"C{colour}", curve.label.rpartition(" (")[0], records[curve])
         ax.set_title(f"{panel.title}, recipe {recipe}", fontsize=10)
         ax.set_xlabel("million environment steps", fontsize=9)
         ax.grid(alpha=0.3)
@@ -91,16 +92,16 @@ def _draw(panel: Panel, records: Records, file: Path) -> Iterator[Path]:
         yield file.with_suffix(suffix)
 
 
-def _band(ax: Axes, label: str, records: Sequence[Record]) -> None:
+def _band(ax: Axes, colour: str, label: str, records: Sequence[Record]) -> None:
     """Mean over seeds, and its 95 % interval by Student's t."""
     length = min(len(record["rows"]) for record in records)
     steps = np.array([row["env_steps"] for row in records[0]["rows"][:length]]) / 1e6
     returns = np.array([[row["eval/return_mean"] for row in record["rows"][:length]] for record in records])
     intervals = [mean_interval(column) for column in returns.T]
-    (line,) = ax.plot(steps, [interval.estimate for interval in intervals], label=f"{label} ({len(records)})")
+    ax.plot(steps, [interval.estimate for interval in intervals], color=colour, label=f"{label} ({len(records)})")
     if len(records) >= _FEWEST_FOR_BAND:
         low, high = ([getattr(interval, end) for interval in intervals] for end in ("low", "high"))
-        ax.fill_between(steps, low, high, alpha=0.2, color=line.get_color(), linewidth=0)
+        ax.fill_between(steps, low, high, alpha=0.2, color=colour, linewidth=0)
 
 
 def _page(by_panel: Mapping[Panel, Records], figures: Path, report: Path) -> Iterator[str]:
