@@ -19,7 +19,7 @@ from rich.console import Console
 
 from experiments.command import parse_flags
 from experiments.errors import Interrupted, UserError, main_guard
-from experiments.panels import (
+from experiments.paper.panels import (
     NUM_SEEDS,
     PANELS,
     TRAJECTORIES,
@@ -99,7 +99,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             _draw_trajectories(flags.work / shown.name, file)
             console.print(f"written: {file}", highlight=False)
     # The drawing library is an extra, and takes a second to load.
-    from experiments.report import write_report
+    from experiments.paper.report import write_report
 
     # The page is about all that is known, whatever was asked for now.
     known = dataclasses.replace(flags, recipes=("paper", "hrlspec"), seeds=max(flags.seeds, NUM_SEEDS))

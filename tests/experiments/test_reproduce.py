@@ -16,10 +16,19 @@ import pytest
 
 import envs_jax
 from experiments import reproduce
-from experiments.claims import CLAIMS, Claim, Record, final_return, finding, mean_return, no_violations, steps_to_most
 from experiments.errors import Interrupted, UserError
 from experiments.options import experiments_of, parse_run
-from experiments.panels import (
+from experiments.paper.claims import (
+    CLAIMS,
+    Claim,
+    Record,
+    final_return,
+    finding,
+    mean_return,
+    no_violations,
+    steps_to_most,
+)
+from experiments.paper.panels import (
     BUDGETS,
     PANELS,
     TRAJECTORY_TASKS,
@@ -32,7 +41,7 @@ from experiments.panels import (
     trajectory_run,
     write_run,
 )
-from experiments.report import write_report
+from experiments.paper.report import write_report
 from hrlspec import compile, parse
 from tests.experiments.tiny import arguments
 

@@ -12,7 +12,8 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.claims import (
+from experiments.options import Recipe
+from experiments.paper.claims import (
     CLAIMS,
     Record,
     Records,
@@ -22,8 +23,7 @@ from experiments.claims import (
     over_seeds,
     steps_to_most,
 )
-from experiments.options import Recipe
-from experiments.panels import PANELS, TRAJECTORIES, TUNING, Curve, Panel, Run
+from experiments.paper.panels import PANELS, TRAJECTORIES, TUNING, Curve, Panel, Run
 from experiments.progress import duration
 from hrlspec.stats import mean_interval
 

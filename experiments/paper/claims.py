@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from experiments.options import Method, Recipe
-from experiments.panels import Curve
+from experiments.paper.panels import Curve
 from hrlspec.stats import Interval, probability_of_improvement, stratified_bootstrap
 
 Record = Mapping[str, Any]
