@@ -18,6 +18,10 @@ _BONUSES = {
     "zone": (Bonus("green", "red", 10.0), Bonus("red", "blue", 20.0, ("yellow",))),
 }
 
+# Where a method's tuning chose another learning rate than its recipe's: the trial whose learning curve has the largest
+# mean (``reproduce --only walk-tuning`` and its like; the trials are in ``docs/results.md``).
+_LEARNING_RATES = {("walk", "hrlspec", "option"): 2e-3}
+
 
 def preset(env_name: str, recipe: str, reward_set: int, method: str) -> Config:
     """The configuration of a run unless told otherwise.
@@ -45,7 +49,8 @@ def preset(env_name: str, recipe: str, reward_set: int, method: str) -> Config:
         config = ltl2action(config)
     if method == "option":
         config = option(config)
-    return config
+    rate = _LEARNING_RATES.get((env_name, recipe, method), config.low.learning_rate)
+    return dataclasses.replace(config, low=dataclasses.replace(config.low, learning_rate=rate))
 
 
 def ltl2action(config: Config) -> Config:

@@ -17,7 +17,7 @@ import pytest
 import envs_jax
 from experiments import reproduce
 from experiments.errors import Interrupted, UserError
-from experiments.options import experiments_of, parse_run
+from experiments.options import Method, Recipe, experiments_of, parse_run
 from experiments.paper.claims import (
     CLAIMS,
     Claim,
@@ -35,6 +35,7 @@ from experiments.paper.panels import (
     TRIED,
     TUNING,
     Curve,
+    Panel,
     Run,
     read_run,
     record_file,
@@ -42,8 +43,11 @@ from experiments.paper.panels import (
     write_run,
 )
 from experiments.paper.report import write_report
+from experiments.presets import preset
 from hrlspec import compile, parse
 from tests.experiments.tiny import arguments
+
+KEPT = Path(__file__).parents[2] / "results" / "paper"
 
 
 def record(curve: list[float], final: float, violations: float = 0.0) -> dict[str, Any]:
@@ -94,6 +98,22 @@ def test_every_method_is_tuned_alike() -> None:
         assert all(rates == list(TRIED[(env, recipe)]) for (recipe, _), rates in tried.items())
         panels = [other for name, other in PANELS.items() if name.startswith(env)]
         assert not {run.seed for run in runs} & {run.seed for other in panels for run in other.runs(5, None)}
+
+
+@pytest.mark.parametrize("panel", TUNING.values(), ids=lambda panel: panel.env)
+def test_presets_have_the_rates_that_tuning_chose(panel: Panel) -> None:
+    """The trials whose records are kept, as far as all of a method's are there."""
+    trials: dict[tuple[Recipe, Method], dict[float, float]] = {}
+    for run in panel.runs(1, None):
+        kept = read_run(run, KEPT)
+        if kept is not None:
+            ((experiment, _),) = experiments_of(parse_run(run.flags))
+            rate = experiment.config.low.learning_rate
+            trials.setdefault((run.curve.recipe, run.curve.method), {})[rate] = mean_return(kept)
+    for (recipe, method), means in trials.items():
+        if len(means) == len(TRIED[panel.env, recipe]):
+            best = max(means, key=lambda rate: means[rate])
+            assert preset(panel.env, recipe, 2, method).low.learning_rate == best
 
 
 def test_the_tasks_of_the_trajectories_are_tasks() -> None:
