@@ -14,8 +14,8 @@ from hrlspec.stats import Interval, probability_of_improvement, stratified_boots
 
 Record = Mapping[str, Any]
 Records = Mapping[Curve, Sequence[Record]]
-FEWEST_SEEDS = 2
-"""Below this nothing is said of a comparison."""
+FEWEST_SEEDS = 5
+"""Below this there is no verdict."""
 
 
 def final_return(record: Record) -> float:
@@ -99,15 +99,17 @@ class Finding:
     @property
     def verdict(self) -> str:
         """``holds`` or ``does not hold`` where the interval excludes a half, else ``undecided``."""
+        if min(self.seeds) < FEWEST_SEEDS:
+            return "too few seeds"
         if self.improvement.low > 0.5:
             return "holds"
         return "does not hold" if self.improvement.high < 0.5 else "undecided"
 
 
 def finding(claim: Claim, recipe: Recipe, records: Records) -> Finding | None:
-    """Looks at one panel's records; ``None`` where there are too few."""
+    """Looks at one panel's records; ``None`` where there are none."""
     sides = [records.get(Curve(method, recipe, switches), ()) for method, switches in (claim.better, claim.worse)]
-    if min(map(len, sides)) < FEWEST_SEEDS:
+    if min(map(len, sides)) < 2:  # a bootstrap over one seed would be sure of itself
         return None
     better, worse = ([claim.score(record) for record in side] for side in sides)
     return Finding(probability_of_improvement(better, worse), (len(better), len(worse)))

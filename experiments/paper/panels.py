@@ -201,6 +201,7 @@ def record_of(folder: Path) -> dict[str, Any] | None:
     suite.pop("per_task", None)
     return {
         "name": summary["name"],
+        "config": made["config"],
         "env_steps": summary["env_steps"],
         "wall_s": summary["wall_s"],
         "versions": made["versions"],

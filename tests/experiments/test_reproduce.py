@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import signal
@@ -17,7 +18,7 @@ import pytest
 import envs_jax
 from experiments import reproduce
 from experiments.errors import Interrupted, UserError
-from experiments.options import Method, Recipe, experiments_of, parse_run
+from experiments.options import Experiment, Method, Recipe, experiment_of, experiments_of, parse_run
 from experiments.paper.claims import (
     CLAIMS,
     Claim,
@@ -45,6 +46,7 @@ from experiments.paper.panels import (
 from experiments.paper.report import write_report
 from experiments.presets import preset
 from hrlspec import compile, parse
+from hrlspec.config import ShieldConfig
 from tests.experiments.tiny import arguments
 
 KEPT = Path(__file__).parents[2] / "results" / "paper"
@@ -116,6 +118,24 @@ def test_presets_have_the_rates_that_tuning_chose(panel: Panel) -> None:
             assert preset(panel.env, recipe, 2, method).low.learning_rate == best
 
 
+def test_kept_records_are_of_what_their_flags_mean_today() -> None:
+    """Whoever changes a preset makes the runs with it again, and deletes their records for that."""
+    every = [run for panel in (PANELS | TUNING).values() for run in panel.runs(5, None)]
+    for run in dict.fromkeys(every):
+        kept = read_run(run, KEPT)
+        if kept is not None:
+            ((experiment, _),) = experiments_of(parse_run(run.flags))
+            assert effective(experiment_of(kept["config"], run.name)) == effective(experiment), run.name
+
+
+def effective(experiment: Experiment) -> Experiment:
+    """Without the settings of a shield that is off."""
+    if experiment.config.shield.mode != "off":
+        return experiment
+    config = dataclasses.replace(experiment.config, shield=ShieldConfig(mode="off"))
+    return dataclasses.replace(experiment, config=config)
+
+
 def test_the_tasks_of_the_trajectories_are_tasks() -> None:
     names = envs_jax.make("walk").propositions
     trees = [compile(parse(text), names, max_nodes=16) for text in TRAJECTORY_TASKS]
@@ -162,6 +182,7 @@ def test_findings() -> None:
     assert verdict(records(0.9, 0.5)) == "holds"
     assert verdict(records(0.5, 0.9)) == "does not hold"
     assert verdict(records(0.7, 0.7)) == "undecided"
+    assert verdict(records(0.9, 0.5, seeds=4)) == "too few seeds"
     assert verdict(records(0.9, 0.5, seeds=1)) is None
     assert finding(claim, "hrlspec", records(0.9, 0.5)) is None
 
