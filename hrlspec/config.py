@@ -93,7 +93,7 @@ class CurriculumConfig:
 
     levels: int = 4
     """K, the longest sequence."""
-    promotion: float = 0.95
+    promotion: float = 0.85
     """Success rate that promotes to the next level."""
     window: int = 512
     """Finished episodes of the current level over which it is measured."""

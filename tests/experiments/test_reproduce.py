@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import os
 import signal
@@ -62,6 +63,16 @@ def record(curve: list[float], final: float, violations: float = 0.0) -> dict[st
     return {"wall_s": 60.0, "rows": rows, "final": {"suite": suite, "contested_choice": {"contested_choice": final}}}
 
 
+@functools.cache
+def _first(run: Run) -> Experiment:
+    return experiments_of(parse_run(run.flags))[0][0]
+
+
+def experiment_now(run: Run) -> Experiment:
+    """What a run's flags mean; they are parsed once for all seeds."""
+    return dataclasses.replace(_first(dataclasses.replace(run, seed=0)), seed=run.seed)
+
+
 def test_there_are_nine_panels_of_the_paper_and_one_of_techniques() -> None:
     kinds = [f"{env}-{kind}" for kind in ("set1", "set2", "ablation") for env in ("letter", "walk", "zone")]
     assert list(PANELS) == [*kinds, "letter-techniques"]
@@ -79,11 +90,11 @@ def test_every_run_is_one_that_can_be_made_and_has_a_name_of_its_own() -> None:
     runs = {run for panel in (PANELS | TUNING).values() for run in panel.runs(1, None)}
     assert len({run.name for run in runs}) == len(runs) == 50 + 54
     for run in runs:
-        ((experiment, _),) = experiments_of(parse_run(run.flags))
+        experiment = experiment_now(run)
         assert (experiment.env, experiment.method, experiment.recipe) == (run.env, run.curve.method, run.curve.recipe)
         assert (experiment.reward_set, experiment.config.total_steps) == (run.reward_set, run.total_steps)
     (plain, no_max, no_shield) = PANELS["letter-techniques"].runs(1, None)
-    configs = [experiments_of(parse_run(run.flags))[0][0].config for run in (plain, no_max, no_shield)]
+    configs = [experiment_now(run).config for run in (plain, no_max, no_shield)]
     assert [config.max_operator for config in configs] == [True, False, True]
     assert [config.shield.mode != "off" for config in configs] == [True, True, False]
 
@@ -93,7 +104,7 @@ def test_every_method_is_tuned_alike() -> None:
         runs = panel.runs(1, None)
         tried: dict[tuple[str, str], list[float]] = {}
         for run in runs:
-            ((experiment, _),) = experiments_of(parse_run(run.flags))
+            experiment = experiment_now(run)
             kind = (run.curve.recipe, run.curve.method)
             tried.setdefault(kind, []).append(experiment.config.low.learning_rate)
         assert len(tried) == 6
@@ -109,7 +120,7 @@ def test_presets_have_the_rates_that_tuning_chose(panel: Panel) -> None:
     for run in panel.runs(1, None):
         kept = read_run(run, KEPT)
         if kept is not None:
-            ((experiment, _),) = experiments_of(parse_run(run.flags))
+            experiment = experiment_now(run)
             rate = experiment.config.low.learning_rate
             trials.setdefault((run.curve.recipe, run.curve.method), {})[rate] = mean_return(kept)
     for (recipe, method), means in trials.items():
@@ -124,7 +135,7 @@ def test_kept_records_are_of_what_their_flags_mean_today() -> None:
     for run in dict.fromkeys(every):
         kept = read_run(run, KEPT)
         if kept is not None:
-            ((experiment, _),) = experiments_of(parse_run(run.flags))
+            experiment = experiment_now(run)
             assert effective(experiment_of(kept["config"], run.name)) == effective(experiment), run.name
 
 
