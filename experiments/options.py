@@ -238,7 +238,7 @@ def _check_level(level: str, settings: PPOConfig) -> None:
     _between(0, 1, f"{level}.gae_lambda", settings.gae_lambda)
     _between(0, 1, f"{level}.expectile", settings.expectile)
     weights = ("clip", "entropy", "final_entropy", "entropy_floor", "final_entropy_floor", "value_coefficient")
-    for name in ("learning_rate", "final_learning_rate", *weights):
+    for name in ("learning_rate", "final_learning_rate", *weights, "relative"):
         _between(0, 1e6, f"{level}.{name}", getattr(settings, name))
     _between(1 + settings.clip, 1e9, f"{level}.most_ratio", settings.most_ratio)
     _between(1e-9, 1e9, f"{level}.max_grad_norm", settings.max_grad_norm)

@@ -46,6 +46,9 @@ def preset(env_name: str, recipe: str, reward_set: int, method: str) -> Config:
         config = dataclasses.replace(config, network=dataclasses.replace(config.network, names=True))
         if (env_name, recipe) == ("walk", "hrlspec"):
             config = walk_with_bonuses(config)
+        if recipe == "hrlspec":
+            # A bonus is ten times what other tasks pay: by their size alone its advantages would drown all others.
+            config = dataclasses.replace(config, low=dataclasses.replace(config.low, relative=1 / config.value_scale))
     if method == "myopic-low":
         config = dataclasses.replace(config, future_embedding=False)
     if method == "no-er":

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from hrlspec import ppo
 from hrlspec.actions import Categorical
 from hrlspec.agent import Agent, Params, TaskBook, View, in_groups
 from hrlspec.config import Config
@@ -299,6 +300,7 @@ def _with_targets(key: jax.Array, config: Config, x: _Experience) -> tuple[LowBa
         discount=config.discount,
         gae_lambda=jnp.where(x.choice.T, config.high.gae_lambda, 1.0),
     )
+    plan_advantage = ppo.relative(plan_advantage.T, x.plan_value, config.high)
     low = LowBatch(
         tree=x.tree,
         view=x.view,
@@ -308,12 +310,12 @@ def _with_targets(key: jax.Array, config: Config, x: _Experience) -> tuple[LowBa
         feasible=x.feasible,
         action=x.action,
         log_prob=x.log_prob,
-        advantage=target - x.value,
+        advantage=ppo.relative(target - x.value, x.value, config.low),
         target=target,
         on_policy=x.on_policy,
         valid=x.valid,
     )
-    return low, _pick_decisions(key, config, x, plan_advantage.T, plan_target.T)
+    return low, _pick_decisions(key, config, x, plan_advantage, plan_target.T)
 
 
 def _pick_decisions(

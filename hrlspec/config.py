@@ -84,6 +84,9 @@ class PPOConfig:
     """What the critic learns of the returns: 0.5 their mean, above it an optimistic expectile, which in deterministic
     worlds approaches the best return within reach."""
     gae_lambda: float = 0.95
+    relative: float = 0.0
+    """r: the policy's advantages are divided by r + |V|, in units of the critic, so that tasks that pay little are
+    learned like tasks that pay much. 0: as they are."""
     max_grad_norm: float = 0.5
 
 

@@ -26,6 +26,11 @@ def normalise(advantage: jax.Array, mask: jax.Array) -> jax.Array:
     return (advantage - mean) / jnp.sqrt(variance + 1e-8)
 
 
+def relative(advantage: jax.Array, value: jax.Array, settings: PPOConfig) -> jax.Array:
+    """Advantages per unit of what was expected: a scale that depends on the state alone, so what is best stays so."""
+    return advantage / (settings.relative + jnp.abs(value)) if settings.relative else advantage
+
+
 def policy_loss(
     log_prob: jax.Array, old: jax.Array, advantage: jax.Array, mask: jax.Array, settings: PPOConfig
 ) -> jax.Array:

@@ -31,6 +31,13 @@ def test_normalise_uses_the_masked_samples_alone() -> None:
     assert result.std() == pytest.approx(1, abs=1e-4)
 
 
+def test_relative_advantages_count_per_unit_of_what_was_expected() -> None:
+    advantage, value = jnp.array([1.0, -1.0, 10.0]), jnp.array([0.5, -1.5, 9.5])
+    scaled = ppo.relative(advantage, value, PPOConfig(relative=0.5))
+    np.testing.assert_allclose(scaled, [1.0, -0.5, 1.0], rtol=1e-6)
+    np.testing.assert_array_equal(ppo.relative(advantage, value, PPOConfig()), advantage)
+
+
 def test_policy_loss_equals_a_plain_reading() -> None:
     rng = np.random.default_rng(1)
     new, old, advantage = rng.normal(size=(3, 50)).astype(np.float32)
