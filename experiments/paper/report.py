@@ -113,7 +113,7 @@ def _page(by_panel: Mapping[Panel, Records], figures: Path, report: Path) -> Ite
     yield "## The paper's claims"
     yield ""
     yield "The share is the probability that a run of the one beats a run of the other. For claims that do not hold,"
-    yield "experiments that look for the reason are in `docs/decisions.md`, \"Where claims do not hold\"."
+    yield 'experiments that look for the reason are in `docs/decisions.md`, "Where claims do not hold".'
     yield ""
     yield "| claim | panel | recipe | share | seeds | verdict |"
     yield "|---|---|---|---|---|---|"
