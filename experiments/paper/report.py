@@ -58,7 +58,7 @@ def write_report(panels: Sequence[Panel], records: Mapping[Run, Record], figures
             yield from _draw(panel, found, figures / panel.name)
     report.parent.mkdir(parents=True, exist_ok=True)
     page = _page(by_panel, Path(os.path.relpath(figures, report.parent)), report)
-    report.write_text("\n".join([*page, *_tuning(tuning)]) + "\n")
+    report.write_text("\n".join([*page, *_times(by_panel), *_tuning(tuning)]) + "\n")
     yield report
 
 
@@ -134,10 +134,6 @@ def _page(by_panel: Mapping[Panel, Records], figures: Path, report: Path) -> Ite
         yield f"| {' | '.join(columns)} | steps to 90 % of it | ratio | training |"
         yield "|---" * (len(columns) + 3) + "|"
         yield from _rows(records)
-        yield ""
-        seconds = sum(record["wall_s"] for some in records.values() for record in some)
-        runs = sum(map(len, records.values()))
-        yield f"These {runs} runs took {duration(seconds)} of training, one after the other."
     if (report.parent / figures / f"{TRAJECTORIES}.png").exists():
         yield ""
         yield "## Walk, trajectories"
@@ -145,6 +141,28 @@ def _page(by_panel: Mapping[Panel, Records], figures: Path, report: Path) -> Ite
         yield "A trained agent (recipe hrlspec, seed 0) on six tasks; reached is outlined, avoided is hatched."
         yield ""
         yield f"![Trajectories]({(figures / TRAJECTORIES).as_posix()}.png)"
+
+
+def _times(by_panel: Mapping[Panel, Records]) -> Iterator[str]:
+    """What the runs took; those of a curve in two panels count in the first."""
+    yield ""
+    yield "## Time"
+    yield ""
+    yield "Training of all runs, one after the other, a core each; two cores side by side take half of it. A curve that is"
+    yield "in several panels counts in the first."
+    yield ""
+    yield f"| panel | {' | '.join(f'recipe {recipe}' for recipe in _RECIPES)} |"
+    yield "|---" * (1 + len(_RECIPES)) + "|"
+    counted: set[tuple[str, int, Curve]] = set()
+    for panel, records in by_panel.items():
+        cells = []
+        for recipe in _RECIPES:
+            curves = [curve for curve in records if curve.recipe == recipe]
+            new = [curve for curve in curves if (panel.env, panel.reward_set, curve) not in counted]
+            runs = [record["wall_s"] for curve in new for record in records[curve]]
+            cells.append(f"{len(runs)} runs, {duration(sum(runs))}" if runs else "")
+            counted |= {(panel.env, panel.reward_set, curve) for curve in new}
+        yield f"| {panel.name} | {' | '.join(cells)} |"
 
 
 def _tuning(trials: Mapping[Panel, Records]) -> Iterator[str]:
