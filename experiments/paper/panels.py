@@ -1,6 +1,7 @@
 """What the paper's figures are made of: panels, their curves, and the record that each run leaves behind.
 
-A record is a run's settings, learning curve and final scores, small enough to be kept; figures and claims are drawn from records.
+A record is a run's settings, learning curve and final scores, small enough to be kept; figures and claims are drawn
+from them.
 """
 
 from __future__ import annotations
