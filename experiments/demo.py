@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +22,7 @@ from experiments import platform
 from experiments.command import parse_flags
 from experiments.demo_worlds import COLUMNS, DILEMMA, DILEMMA_TASK, DOORS, MIDDLE, ROWS, Rooms, fewest_steps
 from experiments.errors import UserError, main_guard
-from experiments.options import Method
+from experiments.options import Method, RewardSet
 from experiments.presets import preset
 from experiments.progress import ProgressDisplay
 from experiments.tables import plain_table, result_console
@@ -36,7 +36,6 @@ PROGRAM = "python -m experiments.demo"
 LAYOUTS = 200
 """Episodes behind each figure of the table."""
 BANK_ITERATIONS = 16
-ROOMS_TASK = "achieve red; achieve blue"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,14 +60,24 @@ class Demo:
         task: what is asked for, a task like those of the curriculum.
         methods: who is trained.
         steps: environment steps.
+        like: the environment and the reward set whose preset serves here.
+        levels: of the curriculum.
+        height: of the picture in inches.
+        draw: draws a layout and the positions ``[t + 1, 2]`` of an episode.
         bonuses: what orders of propositions earn beyond the 1 for the task.
+        ways: what is to be told from each other, by name: the steps it takes in a layout; the best first.
     """
 
     env: Any
     task: str
     methods: tuple[Method, ...]
     steps: int
+    like: tuple[str, RewardSet]
+    levels: int
+    height: float
+    draw: Callable[[Any, Any, np.ndarray], None]
     bonuses: tuple[Bonus, ...] = ()
+    ways: Mapping[str, Callable[[Any], int]] = dataclasses.field(default_factory=dict)
 
     @functools.cached_property
     def machine(self) -> RewardMachine:
@@ -77,14 +86,12 @@ class Demo:
 
     def config(self, method: Method, steps: int) -> Config:
         """Settings of a method."""
-        name, reward_set = ("letter", 1) if isinstance(self.env, Rooms) else ("walk", 2)
-        config = preset(name, "hrlspec", reward_set, method)
-        # Two colours leave nothing to avoid and no long tasks; turning the rooms would move their doors.
-        levels = 2 if isinstance(self.env, Rooms) else 3
+        env_name, reward_set = self.like
+        config = preset(env_name, "hrlspec", reward_set, method)
         # The ball behind the locked door is found by chance, and rarely: what is found teaches in hindsight, and tasks
         # that are mastered wait for no other.
         curriculum = dataclasses.replace(
-            config.curriculum, levels=levels, promotion=0.7, contested=0.0, tasks_per_level=64
+            config.curriculum, levels=self.levels, promotion=0.7, contested=0.0, tasks_per_level=64
         )
         return dataclasses.replace(
             config,
@@ -96,16 +103,9 @@ class Demo:
             low=dataclasses.replace(config.low, minibatches=16),
             curriculum=curriculum,
             relabel=dataclasses.replace(config.relabel, visits=True),
+            # Turning the rooms would move their doors.
             network=dataclasses.replace(config.network, symmetric=False),
         )
-
-
-DEMOS = {
-    "rooms": Demo(Rooms(), ROOMS_TASK, ("ours", "option"), 600_000),
-    "dilemma": Demo(
-        DILEMMA, DILEMMA_TASK, ("ours", "option", "ltl2action"), 1_000_000, bonuses=(Bonus("b", "c", 9.0),)
-    ),
-}
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -181,34 +181,31 @@ def table(demo: Demo, shown: dict[Method, Shown]) -> Table:
         episodes = some.episodes
         steps = episodes.steps[episodes.success].mean() if episodes.success.any() else float("nan")
         result.add_row(method, f"{episodes.success.mean():.3f}", f"{steps:.1f}", f"{episodes.returns.mean():.2f}")
-    if isinstance(demo.env, Rooms):
-        layouts = next(iter(shown.values())).layouts
-        each = [jax.tree.map(lambda x, i=i: x[i], layouts) for i in range(LAYOUTS)]
-        for name, first in (("key first: best", True), ("red first: myopic", False)):
-            result.add_row(name, "1.000", f"{np.mean([fewest_steps(x, key_first=first) for x in each]):.1f}", "1.00")
+    for name, steps in ways(demo, shown).items():
+        result.add_row(name, "1.000", f"{steps.mean():.1f}", "1.00")
     return result
+
+
+def ways(demo: Demo, shown: Mapping[Method, Shown]) -> dict[str, np.ndarray]:
+    """What each of the example's ways takes in each of the layouts, int ``[B]``."""
+    layouts = next(iter(shown.values())).layouts
+    each = [jax.tree.map(lambda x, i=i: x[i], layouts) for i in range(LAYOUTS)]
+    return {name: np.array([way(layout) for layout in each]) for name, way in demo.ways.items()}
 
 
 def draw(demo: Demo, shown: dict[Method, Shown], file: Path) -> Path:
     """One episode of each method, in the same layout: the one where most is at stake."""
     from matplotlib.figure import Figure
 
-    index = 0
-    if isinstance(demo.env, Rooms):
-        layouts = next(iter(shown.values())).layouts
-        each = [jax.tree.map(lambda x, i=i: x[i], layouts) for i in range(LAYOUTS)]
-        loss = [fewest_steps(x, key_first=False) - fewest_steps(x, key_first=True) for x in each]
-        index = int(np.argmax(loss))
-    figure = Figure(figsize=(5 * len(shown), 2.4 if isinstance(demo.env, Rooms) else 4.6), layout="constrained")
+    steps_of_ways = [*ways(demo, shown).values()]
+    index = int(np.argmax(steps_of_ways[-1] - steps_of_ways[0])) if steps_of_ways else 0
+    figure = Figure(figsize=(5 * len(shown), demo.height), layout="constrained")
     axes: Any = figure.subplots(1, len(shown), squeeze=False)
     for ax, (method, some) in zip(axes[0], shown.items(), strict=True):
         running = np.asarray(some.trace.running)[:, index]
         positions = np.asarray(some.trace.env_state.position)[: running.sum() + 1, index]
         layout = jax.tree.map(lambda x: x[index], some.layouts)
-        if isinstance(demo.env, Rooms):
-            _draw_rooms(ax, layout, positions)
-        else:
-            _draw_discs(ax, positions)
+        demo.draw(ax, layout, positions)
         steps, earned = int(some.episodes.steps[index]), float(some.episodes.returns[index])
         ax.set_title(f"{method}: {steps} steps, return {earned:g}", fontsize=10)
         ax.set_axis_off()
@@ -231,9 +228,10 @@ def _draw_rooms(ax: Any, layout: Any, positions: np.ndarray) -> None:
     ax.plot(positions[0, 1] + aside[0], positions[0, 0] + aside[0], "s", color="tab:green", markersize=6)
 
 
-def _draw_discs(ax: Any, positions: np.ndarray) -> None:
+def _draw_discs(ax: Any, layout: Any, positions: np.ndarray) -> None:
     from matplotlib.patches import Circle
 
+    del layout  # there is one alone
     for name, x, y, radius in DILEMMA.discs:
         ax.add_patch(Circle((x, y), radius, color="tab:orange" if name == "c" else "tab:gray", alpha=0.4))
         ax.text(x, y, name, ha="center", va="center")
@@ -242,6 +240,35 @@ def _draw_discs(ax: Any, positions: np.ndarray) -> None:
     ax.set_xlim(-1, 9)
     ax.set_ylim(-1, 4)
     ax.set_aspect("equal")
+
+
+DEMOS = {
+    "rooms": Demo(
+        Rooms(),
+        "achieve red; achieve blue",
+        ("ours", "option"),
+        600_000,
+        like=("letter", 1),
+        levels=2,  # two colours make no longer tasks
+        height=2.4,
+        draw=_draw_rooms,
+        ways={
+            "key first: best": functools.partial(fewest_steps, key_first=True),
+            "red first: myopic": functools.partial(fewest_steps, key_first=False),
+        },
+    ),
+    "dilemma": Demo(
+        DILEMMA,
+        DILEMMA_TASK,
+        ("ours", "option", "ltl2action"),
+        1_000_000,
+        like=("walk", 2),
+        levels=3,
+        height=4.6,
+        draw=_draw_discs,
+        bonuses=(Bonus("b", "c", 9.0),),
+    ),
+}
 
 
 if __name__ == "__main__":
