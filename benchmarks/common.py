@@ -132,7 +132,9 @@ def training(name: str, recipe: str, seconds: float) -> dict[str, Any]:
         tasks = jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank)
         book = agent.open_book(state.params, tasks)
         pool = fill_pool(jax.random.key(1), agent, book, state.curriculum.level, config.episode_slots)
-        return collect(jax.random.key(2), agent, state.params, machine, book, collector, pool)[0]
+        return collect(
+            jax.random.key(2), agent, state.params, machine, book, collector, pool, config.noise_correlation
+        )[0]
 
     result["rollout_steps_per_s"] = rate(roll, state.collector, config.steps_per_iteration, seconds)
     iterate = functools.partial(_iterate, trainer, bank, machine, reserved)

@@ -99,6 +99,7 @@ class Demo:
             # The worlds are small, and so are the runs: many updates, and noise that does not end at the walls.
             num_envs=128,
             noise_correlation=0.95,
+            final_noise_correlation=0.95,
             discount=max(config.discount, 0.95),
             low=dataclasses.replace(config.low, minibatches=16),
             curriculum=curriculum,

@@ -215,6 +215,7 @@ def check_config(config: Config) -> None:
     ):
         _between(0, 1e6, name, value)
     _between(0, 0.999, "noise_correlation", config.noise_correlation)
+    _between(0, 0.999, "final_noise_correlation", config.final_noise_correlation)
     _between(1e-6, 1e6, "value_scale", config.value_scale)
     _between(0, 1e6, "network.advice", network.advice)
     for field in dataclasses.fields(network):
@@ -222,10 +223,11 @@ def check_config(config: Config) -> None:
         least = 1 if field.name in ("latent", "planner_features", "planner_hidden", "task_features") else 0
         for size in sizes if isinstance(sizes, tuple) else (sizes,):
             _at_least(1 if isinstance(sizes, tuple) else least, f"network.{field.name}", size)
-    if network.whole_task and (network.roles or network.advice or network.task_rounds or config.options):
+    parts = (network.roles, network.advice, network.task_rounds, network.memory, config.options)
+    if network.whole_task and any(parts):
         raise UserError(
             "--config.network.whole-task leaves no sub-task: expected it without network.roles, network.advice, "
-            "network.task-rounds and options"
+            "network.task-rounds, network.memory and options"
         )
     _check_level("low", config.low)
     _check_level("high", config.high)

@@ -38,7 +38,7 @@ class Distribution(Protocol):
         """Noise for draws, float32 ``[*shape, *noise_shape]``. The key is consumed."""
         ...
 
-    def noise_sequence(self, key: jax.Array, length: int, correlation: float) -> jax.Array:
+    def noise_sequence(self, key: jax.Array, length: int, correlation: jax.Array | float) -> jax.Array:
         """Noise for successive steps, float32 ``[length, *noise_shape]``; correlated where it makes sense."""
         ...
 
@@ -79,7 +79,7 @@ class Categorical:
         """See :class:`Distribution`."""
         return jax.random.gumbel(key, (*shape, self.num_actions))
 
-    def noise_sequence(self, key: jax.Array, length: int, correlation: float) -> jax.Array:
+    def noise_sequence(self, key: jax.Array, length: int, correlation: jax.Array | float) -> jax.Array:
         """See :class:`Distribution`; never correlated."""
         del correlation
         return self.noise(key, (length,))
@@ -135,12 +135,10 @@ class DiagonalGaussian:
         """See :class:`Distribution`."""
         return jax.random.normal(key, (*shape, self.size))
 
-    def noise_sequence(self, key: jax.Array, length: int, correlation: float) -> jax.Array:
+    def noise_sequence(self, key: jax.Array, length: int, correlation: jax.Array | float) -> jax.Array:
         """See :class:`Distribution`: a stationary first-order autoregression, standard normal at every step."""
         white = self.noise(key, (length,))
-        if not correlation:
-            return white
-        fresh = float(np.sqrt(1 - correlation**2))
+        fresh = jnp.sqrt(1 - correlation**2)
 
         def step(before: jax.Array, drawn: jax.Array) -> tuple[jax.Array, jax.Array]:
             now = correlation * before + fresh * drawn

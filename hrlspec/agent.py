@@ -130,7 +130,8 @@ class Agent:
             return dataclasses.replace(jax.tree.map(lambda x: x[(*where, edge)], told), ahead=ahead)
         future: Any = self.controller.apply(params["controller"], told.future[where], feasible, method="remaining")
         nothing = jnp.zeros((*edge.shape, told.reach.shape[-1]))
-        return Instruction(reach=nothing, avoid=nothing, ahead=ahead, future=future)
+        behind = jnp.zeros((*edge.shape, 0, told.reach.shape[-1]))
+        return Instruction(reach=nothing, avoid=nothing, ahead=ahead, behind=behind, future=future)
 
     def plan(self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction) -> Estimate:
         """The planner on one environment: logits over edges ``[N]`` and the value of the remaining task ``[]``."""
@@ -198,7 +199,7 @@ class Agent:
             return jax.vmap(self.control, in_axes=(None, 0, 0))(params, seen, way)[1]
 
         env = jnp.repeat(jnp.arange(known.shape[0]), num_ways)
-        flat_ways = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), ways)
+        flat_ways = jax.tree.map(lambda x: x.reshape((known.size, *x.shape[2:])), ways)
         group = 2 * self.config.group
         values = in_groups(value, known.reshape(-1), (env, flat_ways), jnp.zeros(env.shape), group)
         advice, ahead = jax.vmap(_weigh)(edge, known, values.reshape(known.shape), ways.ahead, told.ahead)

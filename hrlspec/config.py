@@ -50,9 +50,13 @@ class NetworkConfig:
     learned in one direction is then known in all."""
     lookahead: int = 2
     """How many later sub-tasks have a role of their own."""
+    memory: int = 0
+    """How many of the sub-tasks completed last the low level remembers: where a reward depends on their order, what the
+    rest of the task is worth depends on them."""
     whole_task: bool = False
     """Whether the low level is told the whole remaining task, p₊ and p₋ on its edges, instead of a sub-task: one flat
-    policy and no planner (the baseline LTL2Action). Then ``task_rounds`` is 0, and roles and advice are off."""
+    policy and no planner (the baseline LTL2Action). Then ``task_rounds`` and ``memory`` are
+    0, and roles and advice are off."""
     child_embeddings: bool = False
     """Whether the planner's logit of an edge also sees the embedding of the node it leads to."""
     advice: float = 0.0
@@ -172,6 +176,9 @@ class Config:
     noise_correlation: float = 0.0
     """Correlation of the noise of successive steps while collecting, for continuous actions: coloured noise explores
     farther than white noise, whose steps cancel out."""
+    final_noise_correlation: float = 0.0
+    """What it comes to in the end, linearly. A policy trained with coloured noise to the end leaves it to the noise to
+    get it out of where it hesitates, and stands still without."""
     value_scale: float = 1.0
     """Returns are divided by this before the critics see them."""
     steps_per_slot: int = 5

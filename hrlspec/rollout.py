@@ -114,6 +114,7 @@ def collect(
     book: TaskBook,
     collector: Collector,
     pool: Pool,
+    correlation: jax.Array | float,
 ) -> tuple[Collector, Trajectory]:
     """Rolls out E×T steps. Workers come and go with a sub-task assigned: decisions are made at the end of a step.
 
@@ -125,6 +126,7 @@ def collect(
         book: tasks: the E running ones, then the bank, level by level.
         collector: where the last rollout stopped.
         pool: what the next episodes start with.
+        correlation: of the noise of successive steps, for continuous actions, float32 ``[]``.
     """
     config = agent.config
     num_envs, num_nodes = config.num_envs, book.tree.parent.shape[-1]
@@ -135,7 +137,7 @@ def collect(
         keys = jax.random.split(jax.random.fold_in(key, env), 3)
         return (
             jax.random.gumbel(keys[0], (config.num_steps, num_nodes)),
-            agent.actions.noise_sequence(keys[1], config.num_steps, config.noise_correlation),
+            agent.actions.noise_sequence(keys[1], config.num_steps, correlation),
             jax.random.split(keys[2], config.num_steps),
         )
 

@@ -128,7 +128,8 @@ class Trainer:
             worker=dataclasses.replace(state.collector.worker, task=jnp.arange(config.num_envs, dtype=jnp.int32)),
         )
         pool = fill_pool(keys[0], agent, book, state.curriculum.level, size=config.episode_slots)
-        collector, trajectory = collect(keys[1], agent, state.params, machine, book, collector, pool)
+        correlation = ppo.annealed(config.noise_correlation, config.final_noise_correlation, self._progress(state))
+        collector, trajectory = collect(keys[1], agent, state.params, machine, book, collector, pool, correlation)
         low, plan = build(keys[2], agent, state.params, machine, book, trajectory, reserved)
         params, optimisers, losses = self._learn(keys[3], state, low, plan, trajectory)
         if config.options:
@@ -150,6 +151,10 @@ class Trainer:
         )
         return new_state, metrics
 
+    def _progress(self, state: TrainState) -> jax.Array:
+        """Share of the iterations that are done."""
+        return state.iteration / self.agent.config.num_iterations
+
     def _transforms(self) -> dict[str, optax.GradientTransformation]:
         config = self.agent.config
         return {
@@ -163,7 +168,7 @@ class Trainer:
     ) -> tuple[Params, dict[str, Any], Metrics]:
         """Updates the three networks; metrics are means over the gradient steps."""
         agent, config = self.agent, self.agent.config
-        progress = state.iteration / config.num_iterations
+        progress = self._progress(state)
         transforms = self._transforms()
         keys = jax.random.split(key, 3)
         params, optimisers, metrics = dict(state.params), dict(state.optimisers), {}

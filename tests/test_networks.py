@@ -277,7 +277,13 @@ def test_the_low_level_turns_with_the_world() -> None:
     assert turns is not None
     params = random_params(agent, 3)
     letters = np.eye(env.num_propositions, dtype=np.float32)
-    told = Instruction(reach=letters[0], avoid=letters[1], ahead=letters[2:], future=np.zeros(network.task_features))
+    told = Instruction(
+        reach=letters[0],
+        avoid=letters[1],
+        ahead=letters[2:],
+        behind=letters[:0],
+        future=np.zeros(network.task_features),
+    )
     control = quick_jit(lambda view: agent.control(params, view, told))
     straight = 0
     for seed in range(10):
@@ -299,7 +305,13 @@ def test_the_low_level_is_reflected_with_the_world() -> None:
     agent, mirrors = Agent(env, small_config(network=network)), env.symmetries
     params = random_params(agent, 3)
     colours = np.eye(4, dtype=np.float32)
-    told = Instruction(reach=colours[0], avoid=colours[1], ahead=colours[2:], future=np.zeros(network.task_features))
+    told = Instruction(
+        reach=colours[0],
+        avoid=colours[1],
+        ahead=colours[2:],
+        behind=colours[:0],
+        future=np.zeros(network.task_features),
+    )
     control = quick_jit(lambda view: agent.control(params, view, told))
     rng = np.random.default_rng(0)
     actions = set()

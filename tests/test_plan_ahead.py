@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hrlspec.agent import Agent
-from hrlspec.networks.tree import lookahead, routes
+from hrlspec.networks.tree import lookahead, lookback, routes
 from hrlspec.spec import TaskTree, advance, initial, open_edges
 from tests.probes import Corridor, on_device, quick_jit, random_params, small_config
 from tests.tasks import random_tree
@@ -49,6 +49,39 @@ def test_lookahead_collects_what_each_depth_reaches() -> None:
             for steps in (1, 2):
                 below = [k for k in np.flatnonzero(tree.valid) if len(way_to(tree, node, k)) == steps]
                 np.testing.assert_array_equal(ahead[node, steps - 1], tree.reach[below].any(0))
+
+
+def test_lookback_recalls_what_was_reached_on_the_way() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(10):
+        tree = random_tree(rng, num_nodes=8, num_propositions=4)
+        behind = np.asarray(lookback(on_device(tree), 3))
+        for edge in np.flatnonzero(tree.valid)[1:]:
+            earlier = tree.reach[way_to(tree, TaskTree.ROOT, edge)[-2::-1]][:3]
+            np.testing.assert_array_equal(behind[edge], np.pad(earlier, ((0, 3 - len(earlier)), (0, 0))))
+
+
+def test_the_low_level_remembers_as_much_as_it_is_told_to() -> None:
+    """Two ways to the same last sub-task: what it is worth may depend on them, as a bonus for an order does."""
+    a, b, c = np.eye(ENV.num_propositions, dtype=bool)[:3]
+    tree = on_device(
+        TaskTree(
+            parent=np.array([-1, 0, 0, 1, 2], np.int32),
+            reach=np.stack([a & b, a, b, c, c]),
+            avoid=np.zeros((5, ENV.num_propositions), bool),
+            accepting=np.array([False, False, False, True, True]),
+            valid=np.ones(5, bool),
+            depth=np.array([0, 1, 1, 2, 2], np.int32),
+        )
+    )
+    for memory in (0, 1):
+        network = dataclasses.replace(small_config().network, roles=True, memory=memory)
+        agent = Agent(ENV, small_config(network=network))
+        params = random_params(agent, 4)
+        told = agent.instruct(params, tree)
+        last = [jax.tree.map(lambda x, e=edge: x[e], told) for edge in (3, 4)]
+        values = [float(agent.control(params, ENV.view_at(2), some)[1]) for some in last]
+        assert (abs(values[0] - values[1]) > 1e-3) == bool(memory)
 
 
 def test_advice_is_the_value_of_the_best_way_and_that_way_is_handed_down() -> None:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import envs_jax
 from hrlspec.agent import Agent, TaskBook
 from hrlspec.batch import LowBatch, PlanBatch, build, plan_state
 from hrlspec.config import CurriculumConfig, RelabelConfig, ShieldConfig
@@ -19,7 +20,8 @@ from hrlspec.interaction import decide, start
 from hrlspec.rewards import Bonus, RewardMachine, reward_machine
 from hrlspec.rollout import Collector, Trajectory, collect, fill_pool
 from hrlspec.spec import TaskState, TaskTree
-from tests.probes import Corridor, pairs, quick_jit, random_params, read_monitor, small_config
+from hrlspec.training import Trainer
+from tests.probes import Corridor, on_device, pairs, quick_jit, random_params, read_monitor, small_config
 from tests.test_agent import read_shield
 from tests.test_rewards import reference as read_rewards
 from tests.test_targets import low_reference, plan_reference
@@ -64,7 +66,7 @@ def prepare(params: Any, bank: TaskTree, key: jax.Array) -> tuple[TaskBook, Coll
 def roll(params: Any, book: TaskBook, collector: Collector, key: jax.Array) -> Rollout:
     keys = jax.random.split(key, 3)
     pool = fill_pool(keys[0], AGENT, book, jnp.int32(LEVEL), size=12)
-    after, trajectory = collect(keys[1], AGENT, params, machine(), book, collector, pool)
+    after, trajectory = collect(keys[1], AGENT, params, machine(), book, collector, pool, 0.0)
     low, plan = build(keys[2], AGENT, params, machine(), book, trajectory, jnp.zeros(1, jnp.uint32))
     return Rollout(trajectory, low, plan, after)
 
@@ -397,3 +399,23 @@ def test_without_unfinished_every_sample_was_completed() -> None:
             completed += bool(t.edge_taken[end, e])
     assert plan.valid.sum() == min(completed, len(plan.valid))
     assert 0 < completed < t.decided.sum()
+
+
+def test_noise_is_as_correlated_as_it_is_asked_to_be() -> None:
+    """An untrained policy of continuous actions is nothing but noise."""
+    env = envs_jax.make("walk")
+    agent = Agent(env, small_config(num_steps=64, shield=ShieldConfig(mode="off")))
+    rewards = reward_machine(env.propositions)
+    bank = on_device(draw_bank(np.random.default_rng(0), agent.config.curriculum, 5, np.zeros(0, np.uint32)))
+
+    @quick_jit
+    def actions(correlation: jax.Array) -> jax.Array:
+        state = Trainer(agent).init(jax.random.key(0), bank, rewards)
+        book = agent.open_book(state.params, jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank))
+        pool = fill_pool(jax.random.key(1), agent, book, jnp.int32(0), size=2)
+        key = jax.random.key(2)
+        return collect(key, agent, state.params, rewards, book, state.collector, pool, correlation)[1].action
+
+    for correlation in (0.0, 0.9):
+        drawn = np.asarray(actions(jnp.float32(correlation)))
+        assert (drawn[1:] * drawn[:-1]).mean() / (drawn**2).mean() == pytest.approx(correlation, abs=0.08)

@@ -1,7 +1,7 @@
 """The low level: a policy and value conditioned on the assigned sub-task and on what remains after it.
 
 Paper, "Low-level Module". Axes: **N** tree nodes, **P** atomic propositions, **G** channels, **D** later sub-tasks,
-**F** features.
+**C** completed sub-tasks, **F** features.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from flax import struct
 from envs_jax import Reflections, Symmetries
 from hrlspec.config import NetworkConfig
 from hrlspec.networks.encoder import MLP, Encoder
-from hrlspec.networks.tree import TaskEmbedding, lookahead
+from hrlspec.networks.tree import TaskEmbedding, lookahead, lookback
 from hrlspec.spec import TaskTree, subtask_avoid
 
 
@@ -30,6 +30,7 @@ class Instruction:
         reach: float32 ``[P]``, p₊ of the assigned sub-task.
         avoid: float32 ``[P]``, p₋ (eq. 2).
         ahead: float32 ``[D, P]``, what may be reached 1, 2, ... sub-tasks after it.
+        behind: float32 ``[C, P]``, what was reached 1, 2, ... sub-tasks before it.
         future: float32 ``[F]``, embedding of the task that remains after it, or of the whole remaining task where no
             sub-task is assigned.
     """
@@ -37,6 +38,7 @@ class Instruction:
     reach: jax.Array
     avoid: jax.Array
     ahead: jax.Array
+    behind: jax.Array
     future: jax.Array
 
 
@@ -149,6 +151,7 @@ class Controller(nn.Module):
             reach=tree.reach.astype(jnp.float32),
             avoid=subtask_avoid(tree).astype(jnp.float32),
             ahead=lookahead(tree, depth).astype(jnp.float32),
+            behind=lookback(tree, self.config.memory).astype(jnp.float32),
             future=embed(tree),
         )
 
@@ -180,7 +183,7 @@ class Controller(nn.Module):
         latent = nn.relu(self.encoder(planes, shared))
         # With the planner's advice there is a plan, and what remains is the rest of the plan.
         future = self.task_embedding.of_way(told.ahead) if self.config.advice else told.future
-        x = jnp.concatenate([latent, told.reach, told.avoid, future])
+        x = jnp.concatenate([latent, told.reach, told.avoid, *told.behind, future])
         outputs = self.actor(x)
         if order is not None:
             outputs = outputs[order]

@@ -50,6 +50,16 @@ def lookahead(tree: TaskTree, depth: int) -> jax.Array:
     return jnp.stack(ahead, 1) if ahead else jnp.zeros((tree.num_nodes, 0, tree.num_propositions), bool)
 
 
+def lookback(tree: TaskTree, depth: int) -> jax.Array:
+    """What was reached 1, 2, ... sub-tasks before each edge, bool ``[N, depth, P]``; nothing before the first."""
+    behind = []
+    node = tree.parent
+    for _ in range(depth):
+        behind.append(tree.reach[node] & (node >= 0)[:, None])
+        node = jnp.where(node >= 0, tree.parent[node], node)
+    return jnp.stack(behind, 1) if behind else jnp.zeros((tree.num_nodes, 0, tree.num_propositions), bool)
+
+
 def routes(tree: TaskTree, node: jax.Array, length: int) -> jax.Array:
     """The way from ``node`` to every node below it: its first ``length`` nodes, int32 ``[N, length]``.
 

@@ -39,7 +39,9 @@ class Walker(Agent):
         child = tree.parent[None, :] == jnp.arange(tree.num_nodes)[:, None]
         following = jnp.where(child.any(-1)[:, None], tree.reach[child.argmax(-1)], False)
         reach, avoid, ahead = (x.astype(jnp.float32) for x in (tree.reach, subtask_avoid(tree), following[:, None]))
-        return Instruction(reach=reach, avoid=avoid, ahead=ahead, future=jnp.zeros((tree.num_nodes, 0)))
+        return Instruction(
+            reach=reach, avoid=avoid, ahead=ahead, behind=ahead[:, :0], future=jnp.zeros((tree.num_nodes, 0))
+        )
 
     def plan_ahead(
         self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
