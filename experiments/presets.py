@@ -25,6 +25,9 @@ _LEARNING_RATES = {
     ("walk", "paper", "ltl2action"): 2e-3,
     ("walk", "paper", "option"): 2e-3,
     ("walk", "hrlspec", "option"): 5e-4,
+    ("zone", "hrlspec", "ours"): 1.4e-3,
+    ("zone", "hrlspec", "ltl2action"): 3.5e-4,
+    ("zone", "hrlspec", "option"): 1.4e-3,
 }
 
 
