@@ -40,6 +40,7 @@ def preset(env_name: str, recipe: str, reward_set: int, method: str) -> Config:
         reward_set: 1 or 2.
         method: ``ours``, a baseline (``ltl2action``, ``option``) or an ablation (``myopic-low``, ``no-er``).
     """
+    world = env_name.split("-")[0]
     config = Config() if recipe == "paper" else hrlspec()
     config = _WORLDS.get(env_name, lambda config: config)(config)
     if reward_set == 2:
@@ -48,7 +49,7 @@ def preset(env_name: str, recipe: str, reward_set: int, method: str) -> Config:
         # A letter without a role in the task can earn a bonus, or cost one.
         config = dataclasses.replace(config, network=dataclasses.replace(config.network, names=True))
         if recipe == "hrlspec":
-            config = _BONUS_WORLDS.get(env_name.split("-")[0], lambda config: config)(config)
+            config = _BONUS_WORLDS.get(world, lambda config: config)(config)
         if recipe == "hrlspec" and not env_name.startswith("letter"):  # not tried there
             # A bonus is ten times what other tasks pay: by their size alone its advantages would drown all others.
             config = dataclasses.replace(config, low=dataclasses.replace(config.low, relative=1 / config.value_scale))
@@ -62,7 +63,7 @@ def preset(env_name: str, recipe: str, reward_set: int, method: str) -> Config:
         config = option(config)
     # An ablation is ours but for one thing.
     tuned = method if method in ("ltl2action", "option") else "ours"
-    rate = _LEARNING_RATES.get((env_name, recipe, tuned), config.low.learning_rate)
+    rate = _LEARNING_RATES.get((world, recipe, tuned), config.low.learning_rate)
     return dataclasses.replace(config, low=dataclasses.replace(config.low, learning_rate=rate))
 
 
