@@ -130,7 +130,7 @@ def _page(by_panel: Mapping[Panel, Records], figures: Path, report: Path) -> Ite
         yield ""
         yield f"![{panel.title}]({(figures / panel.name).as_posix()}.png)"
         yield ""
-        columns = ("curve", "seeds", "final return", "success", "SPL", "contested", "mean of the curve")
+        columns = ("curve", "seeds", "final return", "success", "steps", "SPL", "contested", "mean of the curve")
         yield f"| {' | '.join(columns)} | steps to 90 % of it | ratio | training |"
         yield "|---" * (len(columns) + 3) + "|"
         yield from _rows(records)
@@ -189,10 +189,15 @@ def _rows(records: Records) -> Iterator[str]:
         steps = over_seeds(steps_to_most, some).estimate
         ratio = f"{fastest[curve.recipe] / steps:.2f}" if curve.recipe in fastest else ""
         suites = [record["final"]["suite"] for record in some]
-        success, spl = (np.mean([suite[name] for suite in suites]) for name in ("success_rate", "spl"))
-        contested = [record["final"].get("contested_choice") for record in some]
-        choice = f"{np.mean([one['contested_choice'] for one in contested]):.3f}" if all(contested) else ""
+        contested = [record["final"].get("contested_choice") or {} for record in some]
+        scores = [_mean(suites, "success_rate"), _mean(suites, "steps_mean", ".0f"), _mean(suites, "spl")]
         wall = duration(float(np.mean([record["wall_s"] for record in some])))
-        final = f"{over_seeds(final_return, some)} | {success:.3f} | {spl:.3f} | {choice}"
+        final = " | ".join([str(over_seeds(final_return, some)), *scores, _mean(contested, "contested_choice")])
         learning = f"{over_seeds(mean_return, some)} | {steps:,.0f} | {ratio} | {wall}"
         yield f"| {curve.label} | {len(some)} | {final} | {learning} |"
+
+
+def _mean(results: Sequence[Mapping[str, Any]], name: str, how: str = ".3f") -> str:
+    """Mean over seeds; nothing where it is not known, as SPL is in Zone, whose optimum nobody knows."""
+    values = [result.get(name) for result in results]
+    return "" if None in values else format(np.mean(np.array(values, float)), how)
