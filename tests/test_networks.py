@@ -16,6 +16,7 @@ import pytest
 
 import envs_jax
 from hrlspec.agent import Agent
+from hrlspec.config import NetworkConfig
 from hrlspec.networks.controller import TURNS, Instruction, turned
 from hrlspec.networks.encoder import convolve
 from hrlspec.networks.planner import MASKED
@@ -269,6 +270,12 @@ def test_the_reach_critic_answers_in_the_unit_interval_for_each_goal() -> None:
     assert ((values > 0) & (values < 1)).all()
 
 
+def instruction(rows: np.ndarray, network: NetworkConfig) -> Instruction:
+    """To reach the first of the propositions (rows ``[R, P]``), avoid the second, and go on with the others."""
+    future = np.zeros(network.task_features)
+    return Instruction(reach=rows[0], avoid=rows[1], ahead=rows[2:], behind=rows[:0], future=future)
+
+
 def test_the_low_level_turns_with_the_world() -> None:
     """Seen through any of the eight turns, it acts as before, turned, and values what it sees alike."""
     env = envs_jax.make("letter")
@@ -277,13 +284,7 @@ def test_the_low_level_turns_with_the_world() -> None:
     assert turns is not None
     params = random_params(agent, 3)
     letters = np.eye(env.num_propositions, dtype=np.float32)
-    told = Instruction(
-        reach=letters[0],
-        avoid=letters[1],
-        ahead=letters[2:],
-        behind=letters[:0],
-        future=np.zeros(network.task_features),
-    )
+    told = instruction(letters, network)
     control = quick_jit(lambda view: agent.control(params, view, told))
     straight = 0
     for seed in range(10):
@@ -305,13 +306,7 @@ def test_the_low_level_is_reflected_with_the_world() -> None:
     agent, mirrors = Agent(env, small_config(network=network)), env.symmetries
     params = random_params(agent, 3)
     colours = np.eye(4, dtype=np.float32)
-    told = Instruction(
-        reach=colours[0],
-        avoid=colours[1],
-        ahead=colours[2:],
-        behind=colours[:0],
-        future=np.zeros(network.task_features),
-    )
+    told = instruction(colours, network)
     control = quick_jit(lambda view: agent.control(params, view, told))
     rng = np.random.default_rng(0)
     actions = set()
