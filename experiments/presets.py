@@ -44,15 +44,14 @@ def preset(env_name: str, recipe: str, reward_set: int, method: str) -> Config:
     config = Config() if recipe == "paper" else hrlspec()
     config = _WORLDS.get(env_name, lambda config: config)(config)
     if reward_set == 2:
-        # Returns reach 18 in Letter; and a bonus at the end of a long branch must outweigh a short one.
-        config = dataclasses.replace(config, value_scale=5.0, discount=max(config.discount, 0.97))
+        # A bonus at the end of a long branch must outweigh a short one.
+        config = dataclasses.replace(config, discount=max(config.discount, 0.97))
         # A letter without a role in the task can earn a bonus, or cost one.
         config = dataclasses.replace(config, network=dataclasses.replace(config.network, names=True))
         if recipe == "hrlspec":
-            config = _BONUS_WORLDS.get(world, lambda config: config)(config)
-        if recipe == "hrlspec" and not env_name.startswith("letter"):  # not tried there
-            # A bonus is ten times what other tasks pay: by their size alone its advantages would drown all others.
-            config = dataclasses.replace(config, low=dataclasses.replace(config.low, relative=1 / config.value_scale))
+            config = _BONUS_WORLDS.get(world, lambda config: config)(with_bonuses(config))
+        else:
+            config = dataclasses.replace(config, value_scale=5.0)  # returns reach 18 in Letter
     if method == "myopic-low":
         config = dataclasses.replace(config, future_embedding=False)
     if method == "no-er":
@@ -133,6 +132,25 @@ def hrlspec() -> Config:
     )
 
 
+def with_bonuses(config: Config) -> Config:
+    """Reward set 2, where a sub-task after the right others pays ten times as much as alone.
+
+    Returns stay as they are: scaled down, the critic has too little to learn from in what a single sub-task pays.
+    """
+    return dataclasses.replace(
+        config,
+        # By their size alone the advantages of a bonus would drown all others.
+        low=dataclasses.replace(config.low, relative=1.0),
+        network=dataclasses.replace(
+            config.network,
+            # As sharp as in set 1, per unit of return.
+            advice=config.network.advice / 5.0,
+            # What "d" is worth after "a" is not what it is worth alone.
+            memory=config.curriculum.levels - 1,
+        ),
+    )
+
+
 def letter12(config: Config) -> Config:
     """Twelve letters: more to tell apart, and no longer tasks. Longer ones are for the evaluation."""
     return dataclasses.replace(config, total_steps=6_000_000)
@@ -195,12 +213,9 @@ def walk_with_bonuses(config: Config) -> Config:
     """Reward set 2 in Walk, where one pair of regions in ten pays a bonus: rare, and worth more than all the rest."""
     return dataclasses.replace(
         config,
-        # The critic must tell those pairs from all others in 2 M steps: its errors count a hundred times as much as
-        # with returns scaled by 5 and half the weight.
-        value_scale=1.0,
+        # The critic must tell those pairs from all others in 2 M steps.
         low=dataclasses.replace(config.low, value_coefficient=2.0),
-        # As sharp as in set 1, per unit of return.
-        network=dataclasses.replace(config.network, advice=config.network.advice / 5.0),
+        network=dataclasses.replace(config.network, memory=0),  # no better with it
         # Where there is a choice the agent goes where it knows the way, and never learns what the others pay.
         curriculum=dataclasses.replace(config.curriculum, tree_share=0.25),
     )
@@ -222,17 +237,8 @@ def zone(config: Config) -> Config:
 
 def zone_with_bonuses(config: Config) -> Config:
     """Reward set 2 in Zone, where orders of colours pay ten and twenty times as much as a sub-task."""
-    return dataclasses.replace(
-        config,
-        # Scaled by 5, what a single sub-task pays is too little for the critic to learn from.
-        value_scale=1.0,
-        # Beside the critic's errors what a step gains is small: paid for entropy, the policy came to act at random.
-        low=dataclasses.replace(config.low, entropy=0.0),
-        # As sharp as in set 1, per unit of return. What "red" is worth after "green" is not what it is worth alone.
-        network=dataclasses.replace(
-            config.network, advice=config.network.advice / 5.0, memory=config.curriculum.levels - 1
-        ),
-    )
+    # Beside the critic's errors what a step gains is small: paid for entropy, the policy came to act at random.
+    return dataclasses.replace(config, low=dataclasses.replace(config.low, entropy=0.0))
 
 
 _BONUS_WORLDS = {"walk": walk_with_bonuses, "zone": zone_with_bonuses}
