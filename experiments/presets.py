@@ -21,6 +21,8 @@ _BONUSES = {
 # Where a method's tuning chose another learning rate than its recipe's: the trial whose learning curve has the largest
 # mean (``reproduce --only walk-tuning`` and its like; the trials are in ``docs/results.md``).
 _LEARNING_RATES = {
+    ("letter", "hrlspec", "ltl2action"): 3.5e-4,
+    ("letter", "hrlspec", "option"): 1.4e-3,
     ("walk", "paper", "ours"): 2e-3,
     ("walk", "paper", "ltl2action"): 2e-3,
     ("walk", "paper", "option"): 2e-3,
