@@ -37,7 +37,7 @@ class LowBatch:
     ahead: jax.Array  # float32 [..., D, P], what was to be reached after it
     feasible: jax.Array  # bool [..., N], the open edges; empty unless the low level is told the whole task
     action: jax.Array  # int32, or float32 [..., A]
-    log_prob: jax.Array  # float32, at the start of the update, under this task
+    log_prob: jax.Array  # float32, what the ratio is taken to
     advantage: jax.Array  # float32
     target: jax.Array  # float32
     on_policy: jax.Array  # bool, counts in the policy loss
@@ -248,7 +248,7 @@ def _copies(
         ahead=shaped(told.ahead),
         feasible=_kept(config, shaped(feasible)),
         action=rollout.action,
-        log_prob=shaped(log_prob),
+        log_prob=rollout.log_prob if config.relabel.corrected else shaped(log_prob),
         value=shaped(value),
         decided=new.decided,
         plan_log_prob=shaped(plan_log_prob),

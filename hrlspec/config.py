@@ -48,6 +48,8 @@ class NetworkConfig:
     """Whether the low level sees the world in one of its turned or reflected forms alone: its goal in one sector, or,
     where vectors are reflected, its own motion forward; in environments that say how, seen by role. What is
     learned in one direction is then known in all."""
+    goal_scale: float = 1.0
+    """p₊ and p₋ are multiplied by this beside the latent: a flag among a hundred features is hardly heard at first."""
     lookahead: int = 2
     """How many later sub-tasks have a role of their own."""
     memory: int = 0
@@ -128,6 +130,9 @@ class RelabelConfig:
     planner_policy: bool = True
     """Whether the planner's policy learns from the copies; its value and transition model always do. In a copy the
     branch taken was not chosen by the planner, and always succeeded."""
+    corrected: bool = True
+    """Whether a copied action counts by how likely the policy makes it under the new task, relative to the probability
+    that it was drawn with under the old one. Off, relative to the new task's own probability before the update."""
     visits: bool = False
     """Whether every proposition visited counts as a completed sub-task, in hindsight, and not only those assigned."""
     branch: float = 0.7

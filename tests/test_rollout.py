@@ -33,7 +33,7 @@ CONFIG = small_config(
     num_steps=48,
     curriculum=CurriculumConfig(levels=3, tasks_per_level=32, max_nodes=8, tree_share=0.5),
     shield=ShieldConfig(threshold=0.6),
-    relabel=RelabelConfig(share=1.0),
+    relabel=RelabelConfig(share=1.0, corrected=False),
     unfinished=True,
 )
 AGENT = Agent(ENV, CONFIG)
@@ -344,6 +344,20 @@ def test_ratios_are_one_at_the_start_of_the_update() -> None:
     np.testing.assert_allclose(recomputed[plan.valid], plan.log_prob[plan.valid], atol=1e-5)
     assert plan.valid.sum() > 50
     assert (recomputed[plan.valid] < -0.1).sum() > 10
+
+
+def test_corrected_copies_keep_the_probability_that_their_actions_were_drawn_with(t: Trajectory) -> None:
+    relabel = dataclasses.replace(CONFIG.relabel, corrected=True)
+    agent = Agent(ENV, dataclasses.replace(CONFIG, relabel=relabel))
+
+    @quick_jit
+    def rebuild(book: TaskBook, t: Trajectory) -> LowBatch:
+        return build(jax.random.key(0), agent, params(), machine(), book, t, jnp.zeros(1, jnp.uint32))[0]
+
+    low = jax.tree.map(np.asarray, rebuild(rollouts()[0], t))
+    copied = [next(e for e in range(E) if (low.view[1][E + i] == low.view[1][e]).all()) for i in range(E)]
+    assert sorted(copied) == list(range(E))
+    np.testing.assert_array_equal(low.log_prob[E:], t.log_prob.T[copied])
 
 
 def test_planner_samples_are_decisions_with_their_targets(t: Trajectory) -> None:
