@@ -243,6 +243,17 @@ def zone_with_bonuses(config: Config) -> Config:
     return dataclasses.replace(config, low=dataclasses.replace(config.low, entropy=0.0))
 
 
+def zone_of_paper(config: Config) -> Config:
+    """Recipe paper in Zone, whose encoder does not know which colour is the goal: hard to learn in 4 M steps."""
+    return dataclasses.replace(
+        config,
+        # With coloured noise the policy learns to be random, not where to go.
+        noise_correlation=0.0,
+        low=dataclasses.replace(config.low, entropy=0.0),
+        network=dataclasses.replace(config.network, goal_scale=4.0),
+    )
+
+
 _BONUS_WORLDS = {"walk": walk_with_bonuses, "zone": zone_with_bonuses}
 _WORLDS = {
     "letter12": letter12,

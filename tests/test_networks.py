@@ -276,6 +276,25 @@ def instruction(rows: np.ndarray, network: NetworkConfig) -> Instruction:
     return Instruction(reach=rows[0], avoid=rows[1], ahead=rows[2:], behind=rows[:0], future=future)
 
 
+def test_scaled_goals_are_goals_with_larger_weights() -> None:
+    network = dataclasses.replace(small_config().network, goal_scale=4.0)
+    plain, scaled = Agent(ENV, small_config()), Agent(ENV, small_config(network=network))
+    params = random_params(plain, 3)
+    rows = slice(network.latent, network.latent + 2 * ENV.num_propositions)
+
+    def louder(path: Any, x: jax.Array) -> jax.Array:
+        first = jax.tree_util.keystr(path) in {f"['params']['{part}']['Dense_0']['kernel']" for part in heads}
+        return x.at[rows].multiply(4.0) if first else x
+
+    heads = ("actor", "critic")
+    told = instruction(np.eye(ENV.num_propositions, dtype=np.float32)[: 2 + network.lookahead], network)
+    heard = {**params, "controller": jax.tree_util.tree_map_with_path(louder, params["controller"])}
+    before, after = plain.control(params, VIEW, told), scaled.control(params, VIEW, told)
+    for a, b, old in zip(after, plain.control(heard, VIEW, told), before, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
+        assert np.abs(np.asarray(a - old)).max() > 1e-3
+
+
 def test_the_low_level_turns_with_the_world() -> None:
     """Seen through any of the eight turns, it acts as before, turned, and values what it sees alike."""
     env = envs_jax.make("letter")
