@@ -216,13 +216,13 @@ def check_config(config: Config) -> None:
         _between(0, 1e6, name, value)
     _between(0, 0.999, "noise_correlation", config.noise_correlation)
     _between(0, 0.999, "final_noise_correlation", config.final_noise_correlation)
-    _between(1e-6, 1e6, "value_scale", config.value_scale)
     _between(0, 1e6, "network.advice", network.advice)
     for field in dataclasses.fields(network):
         sizes = getattr(network, field.name)
         least = 1 if field.name in ("latent", "planner_features", "planner_hidden", "task_features") else 0
         for size in sizes if isinstance(sizes, tuple) else (sizes,):
             _at_least(1 if isinstance(sizes, tuple) else least, f"network.{field.name}", size)
+    _between(1e-3, 1e3, "network.task_scale", network.task_scale)
     parts = (network.roles, network.advice, network.task_rounds, network.memory, config.options)
     if network.whole_task and any(parts):
         raise UserError(

@@ -45,6 +45,8 @@ def preset(env_name: str, recipe: str, reward_set: int, method: str) -> Config:
     world = env_name.split("-")[0]
     config = Config() if recipe == "paper" else hrlspec()
     config = _WORLDS.get(env_name, lambda config: config)(config)
+    if (world, recipe) == ("zone", "paper"):
+        config = zone_of_paper(config)
     if reward_set == 2:
         # A bonus at the end of a long branch must outweigh a short one.
         config = dataclasses.replace(config, discount=max(config.discount, 0.97))
@@ -52,8 +54,6 @@ def preset(env_name: str, recipe: str, reward_set: int, method: str) -> Config:
         config = dataclasses.replace(config, network=dataclasses.replace(config.network, names=True))
         if recipe == "hrlspec":
             config = _BONUS_WORLDS.get(world, lambda config: config)(with_bonuses(config))
-        else:
-            config = dataclasses.replace(config, value_scale=5.0)  # returns reach 18 in Letter
     if method == "myopic-low":
         config = dataclasses.replace(config, future_embedding=False)
     if method == "no-er":
@@ -123,6 +123,7 @@ def hrlspec() -> Config:
             planner_hidden=64,
             planner_policy=(64,),
             child_embeddings=True,
+            task_scale=1.0,  # seen by role, the goal needs no flag
             critic=(128, 128),
             # The learned correction alone misleads: it is trained on relabelled paths, all of which succeeded.
             advice=400.0,
@@ -135,10 +136,7 @@ def hrlspec() -> Config:
 
 
 def with_bonuses(config: Config) -> Config:
-    """Reward set 2, where a sub-task after the right others pays ten times as much as alone.
-
-    Returns stay as they are: scaled down, the critic has too little to learn from in what a single sub-task pays.
-    """
+    """Reward set 2, where a sub-task after the right others pays ten times as much as alone."""
     return dataclasses.replace(
         config,
         # By their size alone the advantages of a bonus would drown all others.
@@ -250,7 +248,6 @@ def zone_of_paper(config: Config) -> Config:
         # With coloured noise the policy learns to be random, not where to go.
         noise_correlation=0.0,
         low=dataclasses.replace(config.low, entropy=0.0),
-        network=dataclasses.replace(config.network, goal_scale=4.0),
     )
 
 

@@ -48,8 +48,9 @@ class NetworkConfig:
     """Whether the low level sees the world in one of its turned or reflected forms alone: its goal in one sector, or,
     where vectors are reflected, its own motion forward; in environments that say how, seen by role. What is
     learned in one direction is then known in all."""
-    goal_scale: float = 1.0
-    """p₊ and p₋ are multiplied by this beside the latent: a flag among a hundred features is hardly heard at first."""
+    task_scale: float = 4.0
+    """What the low level is told of its task is multiplied by this: a flag beside a hundred features of the latent is
+    hardly heard at first."""
     lookahead: int = 2
     """How many later sub-tasks have a role of their own."""
     memory: int = 0
@@ -184,8 +185,6 @@ class Config:
     final_noise_correlation: float = 0.0
     """What it comes to in the end, linearly. A policy trained with coloured noise to the end leaves it to the noise to
     get it out of where it hesitates, and stands still without."""
-    value_scale: float = 1.0
-    """Returns are divided by this before the critics see them."""
     steps_per_slot: int = 5
     """A rollout tells T divided by this many episodes of an environment apart, two at least."""
     planner_share: int = 16

@@ -276,11 +276,13 @@ def instruction(rows: np.ndarray, network: NetworkConfig) -> Instruction:
     return Instruction(reach=rows[0], avoid=rows[1], ahead=rows[2:], behind=rows[:0], future=future)
 
 
-def test_scaled_goals_are_goals_with_larger_weights() -> None:
-    network = dataclasses.replace(small_config().network, goal_scale=4.0)
-    plain, scaled = Agent(ENV, small_config()), Agent(ENV, small_config(network=network))
+def test_a_scaled_task_is_a_task_with_larger_weights() -> None:
+    network = small_config().network
+    plain, scaled = (
+        Agent(ENV, small_config(network=dataclasses.replace(network, task_scale=scale))) for scale in (1.0, 4.0)
+    )
     params = random_params(plain, 3)
-    rows = slice(network.latent, network.latent + 2 * ENV.num_propositions)
+    rows = slice(network.latent, None)
 
     def louder(path: Any, x: jax.Array) -> jax.Array:
         first = jax.tree_util.keystr(path) in {f"['params']['{part}']['Dense_0']['kernel']" for part in heads}

@@ -183,8 +183,8 @@ class Controller(nn.Module):
         latent = nn.relu(self.encoder(planes, shared))
         # With the planner's advice there is a plan, and what remains is the rest of the plan.
         future = self.task_embedding.of_way(told.ahead) if self.config.advice else told.future
-        goal = self.config.goal_scale * jnp.concatenate([told.reach, told.avoid])
-        x = jnp.concatenate([latent, goal, *told.behind, future])
+        task = jnp.concatenate([told.reach, told.avoid, *told.behind, future])
+        x = jnp.concatenate([latent, self.config.task_scale * task])
         outputs = self.actor(x)
         if order is not None:
             outputs = outputs[order]

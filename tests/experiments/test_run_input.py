@@ -41,7 +41,7 @@ BAD_FLAGS = [
     ("--config.num-steps 1", "--config.num-steps is 1"),
     ("--config.discount 1.5", "--config.discount is 1.5"),
     ("--config.discount nan", "--config.discount is nan"),
-    ("--config.value-scale 0", "--config.value-scale is 0"),
+    ("--config.network.task-scale 0", "--config.network.task-scale is 0"),
     ("--config.shield.mode maybe", "--config.shield.mode"),
     ("--config.shield.threshold 2", "--config.shield.threshold is 2"),
     ("--config.relabel.share -0.1", "--config.relabel.share is -0.1"),
