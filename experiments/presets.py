@@ -24,7 +24,7 @@ _LEARNING_RATES = {
     ("letter", "hrlspec", "ltl2action"): 3.5e-4,
     ("letter", "hrlspec", "option"): 1.4e-3,
     ("walk", "paper", "ours"): 2e-3,
-    ("walk", "paper", "ltl2action"): 2e-3,
+    ("walk", "paper", "ltl2action"): 5e-4,
     ("walk", "paper", "option"): 2e-3,
     ("walk", "hrlspec", "option"): 5e-4,
     ("zone", "hrlspec", "ours"): 1.4e-3,
