@@ -30,12 +30,12 @@ from hrlspec.stats import mean_interval
 _ABOUT = """\
 Written by `python -m experiments.reproduce` from the records in `results/paper`; each names the flags that made it.
 Returns are undiscounted means over 2,000 episodes of 200 unseen tasks (at the end) or 100 episodes of 10 (along the
-curves), actions sampled, no shield; steps are those of successful episodes, "of optimum" is the share of the best way's
-return where an exact planner knows it (suite `branches`). Figures are interquartile means over seeds
-with stratified bootstrap intervals (95 %); bands are Student's t intervals. All methods run through the same loop, with
-the same curriculum and, but for No-ER, relabelling. Recipe `paper` collects with the shield, also for Option;
-LTL2Action has no sub-task and so nothing to shield. Recipe `hrlspec` has no shield. Training times are of runs side by
-side, one on each core, with compilation and evaluations; a few include a pause or other programs beside them."""
+curves), actions sampled, no shield. Steps are those of successful episodes; "of optimum" is the share of the best way's
+return, where an exact planner knows it (suite `branches`). Figures are interquartile means over seeds with stratified
+bootstrap intervals (95 %); bands are Student's t intervals. All methods run through the same loop, with the same
+curriculum and, but for No-ER, relabelling. Recipe `paper` collects with the shield, also for Option; LTL2Action has no
+sub-task and so nothing to shield. Recipe `hrlspec` has no shield. Training times are of runs side by side, one on each
+core, with compilation and evaluations; a few include a pause or other programs beside them."""
 _RECIPES: tuple[Recipe, ...] = ("paper", "hrlspec")
 _FEWEST_FOR_BAND = 3
 """Student's t interval of two seeds is twelve times as wide as what they differ by."""
