@@ -122,7 +122,8 @@ def test_presets_have_the_rates_that_tuning_chose(panel: Panel) -> None:
         if kept is not None:
             experiment = experiment_now(run)
             rate = experiment.config.low.learning_rate
-            trials.setdefault((run.curve.recipe, run.curve.method), {})[rate] = mean_return(kept)
+            score = mean_return(kept) + final_return(kept)
+            trials.setdefault((run.curve.recipe, run.curve.method), {})[rate] = score
     for (recipe, method), means in trials.items():
         if len(means) == len(TRIED[panel.env, recipe]):
             best = max(means, key=lambda rate: means[rate])
