@@ -182,7 +182,7 @@ def test_baselines_train_in_the_same_loop(method: str) -> None:
     for _ in range(60):
         state, metrics = trainer.iterate(state, bank, machine, np.zeros(0, np.uint32))
         rates.append(float(metrics["successes"] / metrics["episodes"]))
-    assert np.mean(rates[-5:]) > 0.9 > np.mean(rates[:3]) + 0.2
+    assert np.mean(rates[-5:]) > 0.9 > rates[0] + 0.2
     jax.tree.map(np.testing.assert_array_equal, planner, jax.tree.map(np.asarray, state.params["planner"]))
     if method == "option":
         known = state.params["options"]
