@@ -131,7 +131,7 @@ def hrlspec() -> Config:
             advice=400.0,
         ),
         curriculum=CurriculumConfig(promotion=0.95, tree_share=0.5, earlier=0.4, contested=0.7),
-        # Copies told by role are no better for being corrected.
+        # Correction changes nothing in Letter and Walk; in Zone it is better, but no run of this recipe has it yet.
         relabel=RelabelConfig(share=0.25, planner_policy=False, corrected=False),
         # The policy learns to avoid by itself; shielded steps are lost to it.
         shield=ShieldConfig(mode="off"),

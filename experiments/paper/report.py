@@ -193,10 +193,10 @@ def _rows(records: Records) -> Iterator[str]:
         ratio = f"{fastest[curve.recipe] / steps:.2f}" if curve.recipe in fastest else ""
         suites = [record["final"]["suite"] for record in some]
         contested = [record["final"].get("contested_choice") or {} for record in some]
-        scores = [_mean(suites, "success_rate"), _mean(suites, "steps_mean", ".0f"), _mean(suites, "spl")]
-        wall = duration(float(np.mean([record["wall_s"] for record in some])))
         optimum = [record["final"].get("return_over_optimum") or {} for record in some]
+        scores = [_mean(suites, "success_rate"), _mean(suites, "steps_mean", ".0f"), _mean(suites, "spl")]
         scores += [_mean(contested, "contested_choice"), _mean(optimum, "return_over_optimum")]
+        wall = duration(float(np.mean([record["wall_s"] for record in some])))
         final = " | ".join([str(over_seeds(final_return, some)), *scores])
         learning = f"{over_seeds(mean_return, some)} | {steps:,.0f} | {ratio} | {wall}"
         yield f"| {curve.label} | {len(some)} | {final} | {learning} |"
