@@ -22,6 +22,9 @@ _BONUSES = {
 # curve's mean and the final return (``reproduce --only walk-tuning`` and its like; the trials are in
 # ``docs/results.md``).
 _LEARNING_RATES = {
+    ("letter", "paper", "ours"): 2e-3,
+    ("letter", "paper", "ltl2action"): 2e-3,
+    ("letter", "paper", "option"): 2e-3,
     ("letter", "hrlspec", "ltl2action"): 3.5e-4,
     ("letter", "hrlspec", "option"): 1.4e-3,
     ("walk", "paper", "ours"): 2e-3,

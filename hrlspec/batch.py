@@ -251,7 +251,7 @@ def _copies(
         log_prob=rollout.log_prob if config.relabel.corrected else shaped(log_prob),
         value=shaped(value),
         decided=new.decided,
-        plan_log_prob=shaped(plan_log_prob),
+        plan_log_prob=jnp.zeros_like(new.reward) if config.relabel.corrected else shaped(plan_log_prob),
         plan_value=shaped(plan_value),
         advice=shaped(advice),
         reward=new.reward,

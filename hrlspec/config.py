@@ -133,7 +133,8 @@ class RelabelConfig:
     branch taken was not chosen by the planner, and always succeeded."""
     corrected: bool = True
     """Whether a copied action counts by how likely the policy makes it under the new task, relative to the probability
-    that it was drawn with under the old one. Off, relative to the new task's own probability before the update."""
+    that it was drawn with under the old one; a copied choice of the planner relative to 1, for the path was no choice.
+    Off, relative to the new task's own probability before the update."""
     visits: bool = False
     """Whether every proposition visited counts as a completed sub-task, in hindsight, and not only those assigned."""
     branch: float = 0.7
@@ -192,7 +193,7 @@ class Config:
     group: int = 32
     """Environments the planner decides for at a time."""
     low: PPOConfig = PPOConfig()
-    high: PPOConfig = PPOConfig(learning_rate=5e-4, epochs=1, minibatches=8, entropy=0.005, final_entropy=0.005)
+    high: PPOConfig = PPOConfig(learning_rate=2e-3, epochs=2, minibatches=8, entropy=0.005, final_entropy=0.005)
     network: NetworkConfig = NetworkConfig()
     curriculum: CurriculumConfig = CurriculumConfig()
     relabel: RelabelConfig = RelabelConfig()

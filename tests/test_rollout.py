@@ -351,13 +351,17 @@ def test_corrected_copies_keep_the_probability_that_their_actions_were_drawn_wit
     agent = Agent(ENV, dataclasses.replace(CONFIG, relabel=relabel))
 
     @quick_jit
-    def rebuild(book: TaskBook, t: Trajectory) -> LowBatch:
-        return build(jax.random.key(0), agent, params(), machine(), book, t, jnp.zeros(1, jnp.uint32))[0]
+    def rebuild(book: TaskBook, t: Trajectory) -> tuple[LowBatch, PlanBatch]:
+        return build(jax.random.key(0), agent, params(), machine(), book, t, jnp.zeros(1, jnp.uint32))
 
-    low = jax.tree.map(np.asarray, rebuild(rollouts()[0], t))
+    low, plan = jax.tree.map(np.asarray, rebuild(rollouts()[0], t))
     copied = [next(e for e in range(E) if (low.view[1][E + i] == low.view[1][e]).all()) for i in range(E)]
     assert sorted(copied) == list(range(E))
     np.testing.assert_array_equal(low.log_prob[E:], t.log_prob.T[copied])
+    # The path of a copy is what happened: it was no choice. All other decisions are the rollout's.
+    drawn = plan.log_prob[plan.valid & (plan.log_prob != 0)]
+    assert 0 < len(drawn) < plan.valid.sum()
+    assert np.isin(drawn, t.plan_log_prob).all()
 
 
 def test_planner_samples_are_decisions_with_their_targets(t: Trajectory) -> None:

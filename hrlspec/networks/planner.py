@@ -31,6 +31,7 @@ class Planner(nn.Module):
         self.project = nn.Dense(features, kernel_init=initializer(1.0))
         self.message = MLP((features, features))
         self.update = MLP((features, features))
+        self.normalise = nn.LayerNorm(use_bias=False, use_scale=False)
         self.policy = MLP((*c.planner_policy, 1), final_scale=0.01)
         self.value = MLP((c.planner_hidden, c.planner_hidden, 1), tanh=True, final_scale=1.0)
 
@@ -77,6 +78,8 @@ class Planner(nn.Module):
             x = jnp.concatenate([x, goal], -1)
             incoming = self.message(jnp.concatenate([x, x[tree.parent], edge], -1))
             x = self.update(jnp.concatenate([x, sum_to_parents(incoming, tree.parent, sends)], -1))
+            # The rounds share their weights: what grows in one grows in all, at first to a hundredfold.
+            x = self.normalise(x)
         return x
 
     def __call__(
