@@ -28,8 +28,8 @@ class NetworkConfig:
     planner_policy: tuple[int, ...] = (128, 128, 128)
     """Hidden units of the planner's policy, which is applied to every edge."""
     planner_rounds: int = 8
-    """Rounds of message passing of the planner; look-ahead ends at this depth. 0: one sweep from the leaves to the
-    root, which looks ahead without limit and costs an eighth."""
+    """Rounds of message passing of the planner, each normalised; look-ahead ends at this depth. 0: one sweep from the
+    leaves to the root, which looks ahead without limit and costs an eighth."""
     task_features: int = 32
     """Node features of the low level's GNN over the remaining tasks."""
     task_rounds: int = 8
