@@ -47,7 +47,7 @@ from experiments.paper.panels import (
 from experiments.paper.report import write_report
 from experiments.presets import preset
 from hrlspec import compile, parse
-from hrlspec.config import ShieldConfig
+from hrlspec.config import PPOConfig, ShieldConfig
 from tests.experiments.tiny import arguments
 
 KEPT = Path(__file__).parents[2] / "results" / "paper"
@@ -141,10 +141,12 @@ def test_kept_records_are_of_what_their_flags_mean_today() -> None:
 
 
 def effective(experiment: Experiment) -> Experiment:
-    """Without the settings of a shield that is off."""
-    if experiment.config.shield.mode != "off":
-        return experiment
-    config = dataclasses.replace(experiment.config, shield=ShieldConfig(mode="off"))
+    """Without the settings of a shield that is off and of a planner that is not there."""
+    config = experiment.config
+    if config.shield.mode == "off":
+        config = dataclasses.replace(config, shield=ShieldConfig(mode="off"))
+    if not config.plans:
+        config = dataclasses.replace(config, high=PPOConfig())
     return dataclasses.replace(experiment, config=config)
 
 
