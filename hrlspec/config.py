@@ -49,8 +49,8 @@ class NetworkConfig:
     where vectors are reflected, its own motion forward; in environments that say how, seen by role. What is
     learned in one direction is then known in all."""
     task_scale: float = 4.0
-    """What the low level is told of its task is multiplied by this: a flag beside a hundred features of the latent is
-    hardly heard at first."""
+    """What the low level is told of its sub-task is multiplied by this: a flag beside a hundred features of the latent
+    is hardly heard at first. The embedding of what comes after it is not: as loud, it would drown the sub-task."""
     lookahead: int = 2
     """How many later sub-tasks have a role of their own."""
     memory: int = 0

@@ -276,20 +276,23 @@ def instruction(rows: np.ndarray, network: NetworkConfig) -> Instruction:
     return Instruction(reach=rows[0], avoid=rows[1], ahead=rows[2:], behind=rows[:0], future=future)
 
 
-def test_a_scaled_task_is_a_task_with_larger_weights() -> None:
-    network = small_config().network
+@pytest.mark.parametrize("whole_task", [False, True])
+def test_a_scaled_task_is_a_task_with_larger_weights(whole_task: bool) -> None:
+    """What is scaled is the sub-task, and the whole task where there is no sub-task, but not what comes later."""
+    network = dataclasses.replace(small_config().network, advice=0.0, roles=False, whole_task=whole_task)
     plain, scaled = (
         Agent(ENV, small_config(network=dataclasses.replace(network, task_scale=scale))) for scale in (1.0, 4.0)
     )
     params = random_params(plain, 3)
-    rows = slice(network.latent, None)
+    rows = slice(network.latent, None if whole_task else -network.task_features)
 
     def louder(path: Any, x: jax.Array) -> jax.Array:
         first = jax.tree_util.keystr(path) in {f"['params']['{part}']['Dense_0']['kernel']" for part in heads}
         return x.at[rows].multiply(4.0) if first else x
 
     heads = ("actor", "critic")
-    told = instruction(np.eye(ENV.num_propositions, dtype=np.float32)[: 2 + network.lookahead], network)
+    told = instruction(np.eye(ENV.num_propositions, dtype=np.float32)[:2], network)
+    told = told.replace(future=np.linspace(-1, 1, network.task_features))
     heard = {**params, "controller": jax.tree_util.tree_map_with_path(louder, params["controller"])}
     before, after = plain.control(params, VIEW, told), scaled.control(params, VIEW, told)
     for a, b, old in zip(after, plain.control(heard, VIEW, told), before, strict=True):

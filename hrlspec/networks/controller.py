@@ -183,8 +183,10 @@ class Controller(nn.Module):
         latent = nn.relu(self.encoder(planes, shared))
         # With the planner's advice there is a plan, and what remains is the rest of the plan.
         future = self.task_embedding.of_way(told.ahead) if self.config.advice else told.future
-        task = jnp.concatenate([told.reach, told.avoid, *told.behind, future])
-        x = jnp.concatenate([latent, self.config.task_scale * task])
+        told_now = [told.reach, told.avoid, *told.behind]
+        # A future as loud as the sub-task drowns it. LTL2Action is told nothing else.
+        told_later = future * (self.config.task_scale if self.config.whole_task else 1.0)
+        x = jnp.concatenate([latent, self.config.task_scale * jnp.concatenate(told_now), told_later])
         outputs = self.actor(x)
         if order is not None:
             outputs = outputs[order]
