@@ -27,7 +27,6 @@ _LEARNING_RATES = {
     ("letter", "paper", "option"): 2e-3,
     ("letter", "hrlspec", "ltl2action"): 3.5e-4,
     ("letter", "hrlspec", "option"): 1.4e-3,
-    ("walk", "paper", "ours"): 2e-3,
     ("walk", "paper", "ltl2action"): 2e-3,
     ("walk", "paper", "option"): 2e-3,
     ("walk", "hrlspec", "option"): 5e-4,
