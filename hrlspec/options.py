@@ -1,7 +1,9 @@
 """The baseline Option: logic value iteration over what options were measured to take (Araki et al., 2021).
 
 An option reaches one sub-goal and knows nothing of what comes after it. What it takes to reach one sub-goal from
-another is measured while collecting, and a sequence is chosen by dynamic programming over the task tree with that.
+another is measured while collecting, and what each sub-goal earns, whatever came before it ("estimated empirically for
+each individual subgoal separately"; paper, "Baseline-2"). A sequence is chosen by dynamic programming over the task
+tree with that.
 
 Axes: **O** origins, the P propositions reached before and, last, the start of an episode; **P** goals; **N** nodes.
 """
@@ -22,13 +24,13 @@ _LEAST = 1e-9
 
 @struct.dataclass
 class Measurements:
-    """Sums over attempts to reach a goal from an origin, older ones fading.
+    """Sums over attempts to reach a goal, older ones fading.
 
     Attributes:
         attempts: float32 ``[O, P]``.
         discounted: float32 ``[O, P]``, of γ^duration, and 0 where the goal was not reached.
-        successes: float32 ``[2, O, P]``, by whether the sub-task was the last of its task.
-        rewards: float32 ``[2, O, P]``, of what they earned.
+        successes: float32 ``[2, P]``, by whether the sub-task was the last of its task.
+        rewards: float32 ``[2, P]``, of what they earned.
     """
 
     attempts: jax.Array
@@ -38,9 +40,9 @@ class Measurements:
 
 
 def unmeasured(num_propositions: int) -> Measurements:
-    """One imagined attempt for each pair, which succeeded at once and earned nothing, so that all are tried."""
+    """One imagined attempt for each, which succeeded at once and earned nothing, so that all are tried."""
     ones = jnp.ones((num_propositions + 1, num_propositions))
-    both = jnp.ones((2, *ones.shape))
+    both = jnp.ones((2, num_propositions))
     return Measurements(attempts=ones, discounted=ones, successes=both, rewards=0 * both)
 
 
@@ -73,14 +75,17 @@ def measure(
     success = ended & reached
     kinds = jnp.stack([success & ~last, success & last]).astype(jnp.float32)
 
-    def total(weight: jax.Array) -> jax.Array:
-        return jnp.einsum("...teo,teg->...og", weight[..., None] * origin, goal)
+    def pairs(weight: jax.Array) -> jax.Array:
+        return jnp.einsum("te,teo,teg->og", weight, origin, goal)
+
+    def goals(weight: jax.Array) -> jax.Array:
+        return jnp.einsum("kte,teg->kg", weight, goal)
 
     return Measurements(
-        attempts=FADING * known.attempts + total(ended.astype(jnp.float32)),
-        discounted=FADING * known.discounted + total(success * discount ** duration.astype(jnp.float32)),
-        successes=FADING * known.successes + total(kinds),
-        rewards=FADING * known.rewards + total(kinds * reward),
+        attempts=FADING * known.attempts + pairs(ended.astype(jnp.float32)),
+        discounted=FADING * known.discounted + pairs(success * discount ** duration.astype(jnp.float32)),
+        successes=FADING * known.successes + goals(kinds),
+        rewards=FADING * known.rewards + goals(kinds * reward),
     )
 
 
@@ -102,7 +107,7 @@ def values(known: Measurements, tree: TaskTree, state: TaskState) -> jax.Array:
     origin = origins(tree)[tree.parent].astype(jnp.float32)
     origin = origin / jnp.maximum(origin.sum(-1, keepdims=True), 1.0)
     reach = jnp.where(tree.reach, origin @ per_attempt, jnp.inf).min(-1)
-    reward = jnp.where(tree.reach, jnp.einsum("no,kop->knp", origin, per_success), -jnp.inf).max(-1)
+    reward = jnp.where(tree.reach, per_success[:, None], -jnp.inf).max(-1)
     reward = jnp.where(tree.accepting, reward[1], reward[0])
     edge = tree.valid & (tree.parent >= 0)
 

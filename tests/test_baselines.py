@@ -104,12 +104,12 @@ def test_a_flat_policy_sees_what_remains_of_its_task() -> None:
 
 def random_measurements(rng: np.random.Generator) -> Measurements:
     attempts = rng.uniform(1, 5, (P + 1, P))
-    successes = rng.uniform(0.5, 4, (2, P + 1, P))
+    successes = rng.uniform(0.5, 4, (2, P))
     arrays = (
         attempts,
         attempts * rng.uniform(0.1, 1, (P + 1, P)),
         successes,
-        successes * rng.uniform(0, 5, (2, P + 1, P)),
+        successes * rng.uniform(0, 5, (2, P)),
     )
     return Measurements(*(jnp.asarray(x, jnp.float32) for x in arrays))
 
@@ -122,7 +122,7 @@ def plain_value(known: Measurements, tree: TaskTree, node: int) -> float:
     takes, earns = [], []
     for goal in np.flatnonzero(tree.reach[node]):
         takes.append(np.mean([known.discounted[o, goal] / known.attempts[o, goal] for o in origins]))
-        earns.append(np.mean([known.rewards[kind, o, goal] / known.successes[kind, o, goal] for o in origins]))
+        earns.append(known.rewards[kind, goal] / known.successes[kind, goal])
     children = [child for child in range(1, tree.num_nodes) if tree.valid[child] and tree.parent[child] == node]
     ahead = 0.0 if tree.accepting[node] else max(plain_value(known, tree, child) for child in children)
     return float(min(takes) * (max(earns) + ahead))
@@ -155,16 +155,17 @@ def test_measurements_are_sums_over_attempts_that_fade() -> None:
     ended, reached, last = rng.random((3, *shape)) < 0.6
     duration, reward = rng.integers(1, 9, shape), rng.normal(size=shape).astype(np.float32)
     known = options.measure(options.unmeasured(P), origin, goal, ended, reached, last, duration, reward, discount=GAMMA)
-    for o in range(P + 1):
-        for g in range(P):
-            here = ended & origin[..., o] & goal[..., g]
-            won = here & reached
-            np.testing.assert_allclose(known.attempts[o, g], FADING + here.sum())
-            np.testing.assert_allclose(known.discounted[o, g], FADING + (GAMMA**duration)[won].sum(), rtol=1e-5)
-            for kind in (0, 1):
-                mine = won & (last == kind)
-                np.testing.assert_allclose(known.successes[kind, o, g], FADING + mine.sum())
-                np.testing.assert_allclose(known.rewards[kind, o, g], reward[mine].sum(), rtol=1e-4, atol=1e-5)
+    for g in range(P):
+        here = ended & goal[..., g]
+        for o in range(P + 1):
+            ours = here & origin[..., o]
+            np.testing.assert_allclose(known.attempts[o, g], FADING + ours.sum())
+            won = (GAMMA**duration)[ours & reached].sum()
+            np.testing.assert_allclose(known.discounted[o, g], FADING + won, rtol=1e-5)
+        for kind in (0, 1):
+            mine = here & reached & (last == kind)
+            np.testing.assert_allclose(known.successes[kind, g], FADING + mine.sum())
+            np.testing.assert_allclose(known.rewards[kind, g], reward[mine].sum(), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("method", ["option", "ltl2action"])
@@ -186,8 +187,9 @@ def test_baselines_train_in_the_same_loop(method: str) -> None:
     jax.tree.map(np.testing.assert_array_equal, planner, jax.tree.map(np.asarray, state.params["planner"]))
     if method == "option":
         known = state.params["options"]
-        # a is in cell 0 and b in cell 4: from one to the other it takes four steps, and earns the bonus.
+        # a is in cell 0 and b in cell 4: from one to the other it takes four steps.
         per_attempt = np.asarray(known.discounted / known.attempts)
         assert GAMMA**7 < per_attempt[0, 1] <= GAMMA**4 + 1e-3
         assert per_attempt[P, 0] > per_attempt[1, 0]
-        np.testing.assert_allclose((known.rewards / known.successes)[1, 0, 1], 3.0, rtol=0.05)
+        # b as the last sub-task earns 1, and 3 after a; what is known is one figure for both.
+        assert 1.0 < (known.rewards / known.successes)[1, 1] < 3.0
