@@ -29,7 +29,7 @@ _LEARNING_RATES = {
     ("letter", "hrlspec", "option"): 1.4e-3,
     ("walk", "paper", "ltl2action"): 2e-3,
     ("walk", "paper", "option"): 2e-3,
-    ("walk", "hrlspec", "option"): 5e-4,
+    ("walk", "hrlspec", "option"): 2e-3,
     ("zone", "paper", "option"): 1.4e-3,
     ("zone", "hrlspec", "ours"): 1.4e-3,
     ("zone", "hrlspec", "ltl2action"): 1.4e-3,
