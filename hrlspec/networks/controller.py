@@ -184,7 +184,7 @@ class Controller(nn.Module):
         # With the planner's advice there is a plan, and what remains is the rest of the plan.
         future = self.task_embedding.of_way(told.ahead) if self.config.advice else told.future
         told_now = [told.reach, told.avoid, *told.behind]
-        # A future as loud as the sub-task drowns it. LTL2Action is told nothing else.
+        # A future as loud as the sub-task drowns it; where there is no sub-task, it is all that is told.
         told_later = future * (self.config.task_scale if self.config.whole_task else 1.0)
         x = jnp.concatenate([latent, self.config.task_scale * jnp.concatenate(told_now), told_later])
         outputs = self.actor(x)
