@@ -189,6 +189,16 @@ def test_the_sweep_looks_ahead_without_limit_and_rounds_as_far_as_they_reach() -
     assert plan(3, chain(near), node=2)[1] != plan(3, chain(far), node=2)[1]
 
 
+def test_what_the_rounds_hand_on_does_not_grow_with_the_weights() -> None:
+    agent, params = setup(3)
+    large = jax.tree.map(lambda weights: 30 * weights, params["planner"])
+    tree = on_device(some_trees(1)[0])
+    latents = jax.random.normal(jax.random.key(0), (tree.num_nodes, agent.config.network.latent))
+    nodes = np.asarray(agent.planner.apply(large, latents, tree, initial(tree), method="embed"))
+    np.testing.assert_allclose(np.sqrt((nodes**2).mean(-1)), 1.0, atol=1e-2)
+    np.testing.assert_allclose(nodes.mean(-1), 0.0, atol=1e-5)
+
+
 def test_one_round_equals_the_sweep_where_nothing_is_below() -> None:
     """Rounds update a node from itself again and again, the sweep once: they agree on leaves after one round."""
     agent, params = setup(0)
