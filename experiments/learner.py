@@ -158,7 +158,6 @@ class Learner:
         """Means over episodes of what the metrics add up over episodes, and over iterations of the others."""
         rest = {name: value / iterations for name, value in sums.items() if name != "level"}
         episodes, successes, returns = (rest.pop(name) for name in ("episodes", "successes", "returns"))
-        rest.pop("lengths", None)
         steps = self.experiment.config.steps_per_iteration
         return {
             "train/success_rate": successes / episodes if episodes else None,

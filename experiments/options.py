@@ -69,7 +69,7 @@ class RunFlags:
     """ltl2action: one flat policy sees the whole task; option: value iteration chooses options; myopic-low: the low
     level does not see what comes after its sub-task; no-er: no relabelled experience."""
     recipe: Recipe = "hrlspec"
-    """paper: as the paper describes it; hrlspec: what was measured to be better."""
+    """paper: the paper's method, made to learn; hrlspec: what was measured to be better."""
     reward_set: RewardSet = 1
     """1: 1 for completing the task; 2: also for sub-tasks and for visiting some in order."""
     seed: int = 0

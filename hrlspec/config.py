@@ -50,14 +50,15 @@ class NetworkConfig:
     learned in one direction is then known in all."""
     task_scale: float = 4.0
     """What the low level is told of its sub-task is multiplied by this: a flag beside a hundred features of the latent
-    is hardly heard at first. The embedding of what comes after it is not: as loud, it would drown the sub-task."""
+    is hardly heard at first. The embedding of what comes after it is not: as loud, it would drown the sub-task. With
+    ``whole_task`` there is no sub-task, and the embedding is multiplied."""
     lookahead: int = 2
     """How many later sub-tasks have a role of their own."""
     memory: int = 0
     """How many of the sub-tasks completed last the low level remembers: where a reward depends on their order, what the
     rest of the task is worth depends on them."""
     whole_task: bool = False
-    """Whether the low level is told the whole remaining task, p₊ and p₋ on its edges, instead of a sub-task: one flat
+    """Whether the low level is told the whole remaining task, with what each edge forbids, instead of a sub-task: one flat
     policy and no planner (the baseline LTL2Action). Then ``task_rounds`` and ``memory`` are
     0, and roles and advice are off."""
     child_embeddings: bool = False

@@ -1,4 +1,4 @@
-"""Contested choices: layouts where going to the nearest goal first costs steps later (DESIGN §7).
+"""Contested choices: layouts where going to the nearest goal first costs steps later.
 
 The tasks are two sub-tasks in sequence, ``achieve a; achieve b``. Where the nearest a leads to a longer way in all,
 only an agent that looks ahead passes it by; in the mirrored controls the nearest a is the right one.

@@ -34,7 +34,9 @@ def relative(advantage: jax.Array, value: jax.Array, settings: PPOConfig) -> jax
 def policy_loss(
     log_prob: jax.Array, old: jax.Array, advantage: jax.Array, mask: jax.Array, settings: PPOConfig
 ) -> jax.Array:
-    """Clipped surrogate; ``old`` is the log-probability at the start of the update, under the same task.
+    """Clipped surrogate; ``old`` is what the ratio is taken to.
+
+    That is the log-probability with which a sample was drawn; for relabelled ones see `RelabelConfig.corrected`.
 
     Where the advantage is negative the plain surrogate has no bound. With ``most_ratio`` it has (Ye et al., 2020, "dual
     clip"): what has become so much likelier during the update counts no more.

@@ -117,8 +117,8 @@ class Trainer:
             reserved: uint32, sorted hashes of held-out tasks, which relabelling must not produce.
 
         Returns:
-            The next state and float32 metrics: sums over finished episodes (``episodes``, ``successes``,
-            ``returns``, ``lengths``), ``violations`` and ``shielded`` per step, the level, and losses.
+            The next state and float32 metrics: ``episodes`` and ``successes`` count what ended in the rollout,
+            ``returns`` is the sum of its rewards; ``violations`` and ``shielded`` per step, the level, and losses.
         """
         agent, config = self.agent, self.agent.config
         keys = jax.random.split(jax.random.fold_in(state.key, state.iteration), 5)
@@ -339,7 +339,7 @@ def _fit(
 
 
 def _summary(trajectory: Trajectory, ended: jax.Array) -> Metrics:
-    """Sums over the rollout's finished episodes, and rates per step."""
+    """Finished episodes and the sum of rewards in a rollout, and rates per step."""
     return {
         "episodes": ended.sum().astype(jnp.float32),
         "successes": trajectory.satisfied.sum().astype(jnp.float32),

@@ -1,4 +1,4 @@
-"""What simple agents score on finite labelled graphs: the marks a planning agent has to beat (DESIGN §7).
+"""What simple agents score on finite labelled graphs: the marks a planning agent has to beat.
 
 Axes: **L** layouts, **S** graph states, **A** actions, **N** tree nodes, **C** children of the root.
 """

@@ -25,15 +25,17 @@ from experiments.paper.claims import (
 )
 from experiments.paper.panels import PANELS, TRAJECTORIES, TUNING, Curve, Panel, Run
 from experiments.progress import duration
-from hrlspec.stats import mean_interval
+from hrlspec.stats import interquartile_mean, mean_interval
 
 _ABOUT = """\
 Written by `python -m experiments.reproduce` from the records in `results/paper`; each names the flags that made it.
 Returns are undiscounted means over 2,000 episodes of 200 unseen tasks (at the end) or 100 episodes of 10 (along the
 curves), actions sampled, no shield. Steps are those of successful episodes; "of optimum" is the share of the best way's
-return, where an exact planner knows it (suite `branches`). Figures are interquartile means over seeds with stratified
-bootstrap intervals (95 %); bands are Student's t intervals. All methods run through the same loop, with the same
-curriculum and, but for No-ER, relabelling. Recipe `paper` collects with the shield, also for Option; LTL2Action has no
+return, where an exact planner knows it (suite `branches`); contested is contested choice, 0.5 for an agent that always
+takes the nearest instance. The ratio is of the steps that ours takes to 90 % of its curve's last value to those of the
+method. Figures are interquartile means over seeds (training: means) with stratified bootstrap intervals (95 %); bands
+are Student's t intervals. All methods run through the same loop, with the same curriculum and, but for No-ER,
+relabelling. Recipe `paper` collects with the shield, also for Option; LTL2Action has no
 sub-task and so nothing to shield. Recipe `hrlspec` has no shield. Training times are of runs side by side, one on each
 core, with compilation and evaluations; a few include a pause or other programs beside them."""
 _RECIPES: tuple[Recipe, ...] = ("paper", "hrlspec")
@@ -113,8 +115,10 @@ def _page(by_panel: Mapping[Panel, Records], figures: Path, report: Path) -> Ite
     yield ""
     yield "## The paper's claims"
     yield ""
-    yield "The share is the probability that a run of the one beats a run of the other. For claims that do not hold,"
-    yield 'experiments that look for the reason are in `docs/decisions.md`, "Where claims do not hold".'
+    yield "The share is the probability that a run of the one beats a run of the other: in the mean of its curve for what"
+    yield "is learned faster or less, in its final return for how it ends. A claim holds, or does not, where the interval"
+    yield "excludes a half. For claims that do not hold, experiments that look for the reason are in `docs/decisions.md`,"
+    yield '"Where claims do not hold".'
     yield ""
     yield "| claim | panel | recipe | share | seeds | verdict |"
     yield "|---|---|---|---|---|---|"
@@ -132,7 +136,7 @@ def _page(by_panel: Mapping[Panel, Records], figures: Path, report: Path) -> Ite
         yield f"![{panel.title}]({(figures / panel.name).as_posix()}.png)"
         yield ""
         scores = ("success", "steps", "SPL", "contested", "of optimum")
-        columns = ("curve", "seeds", "final return", *scores, "mean of the curve", "steps to 90 % of it", "ratio")
+        columns = ("curve", "seeds", "final return", *scores, "mean of the curve", "steps to 90 %", "ratio")
         yield f"| {' | '.join(columns)} | training |"
         yield "|---" * (len(columns) + 1) + "|"
         yield from _rows(records)
@@ -162,7 +166,7 @@ def _times(by_panel: Mapping[Panel, Records]) -> Iterator[str]:
             curves = [curve for curve in records if curve.recipe == recipe]
             new = [curve for curve in curves if (panel.env, panel.reward_set, curve) not in counted]
             runs = [record["wall_s"] for curve in new for record in records[curve]]
-            cells.append(f"{len(runs)} runs, {duration(sum(runs))}" if runs else "")
+            cells.append(f"{len(runs)} {'run' if len(runs) == 1 else 'runs'}, {duration(sum(runs))}" if runs else "")
             counted |= {(panel.env, panel.reward_set, curve) for curve in new}
         yield f"| {panel.name} | {' | '.join(cells)} |"
 
@@ -203,6 +207,6 @@ def _rows(records: Records) -> Iterator[str]:
 
 
 def _mean(results: Sequence[Mapping[str, Any]], name: str, how: str = ".3f") -> str:
-    """Mean over seeds; nothing where it is not known, as SPL is in Zone, whose optimum nobody knows."""
+    """Interquartile mean; nothing where it is not known, as SPL is in Zone, whose optimum nobody knows."""
     values = [result.get(name) for result in results]
-    return "" if None in values else format(np.mean(np.array(values, float)), how)
+    return "" if None in values else format(interquartile_mean(values), how)

@@ -89,7 +89,7 @@ class TaskEmbedding(nn.Module):
     Attributes:
         features: F.
         rounds: rounds of message passing, or 0 for one sweep from the leaves to the root.
-        negatives: whether p₋ is on the edges too, as in LTL2Action.
+        negatives: whether what an edge forbids by itself is on it too, as in LTL2Action.
     """
 
     features: int
