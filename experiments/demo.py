@@ -22,6 +22,7 @@ from experiments import platform
 from experiments.command import parse_flags
 from experiments.demo_worlds import COLUMNS, DILEMMA, DILEMMA_TASK, DOORS, MIDDLE, ROWS, Rooms, fewest_steps
 from experiments.errors import UserError, main_guard
+from experiments.learner import BANK_ITERATIONS
 from experiments.options import Method, RewardSet
 from experiments.presets import preset
 from experiments.progress import ProgressDisplay
@@ -35,7 +36,6 @@ from hrlspec.rewards import Bonus, RewardMachine, reward_machine
 PROGRAM = "python -m experiments.demo"
 LAYOUTS = 200
 """Episodes behind each figure of the table."""
-BANK_ITERATIONS = 16
 
 
 @dataclasses.dataclass(frozen=True)

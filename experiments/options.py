@@ -18,6 +18,7 @@ from hrlspec.config import Config, PPOConfig
 
 Method = Literal["ours", "ltl2action", "option", "myopic-low", "no-er"]
 Recipe = Literal["paper", "hrlspec"]
+RECIPES: tuple[Recipe, ...] = typing.get_args(Recipe)
 RewardSet = Literal[1, 2]
 
 PROGRAM = "python -m experiments.run"

@@ -142,7 +142,8 @@ def hrlspec() -> Config:
             advice=400.0,
         ),
         curriculum=CurriculumConfig(promotion=0.95, tree_share=0.5, earlier=0.4, contested=0.7),
-        # Correction changes nothing in Letter and Walk; in Zone it is better, but the records of this recipe were made without.
+        # Correction changes nothing in Letter and Walk; in Zone it is better, but the records of this recipe were made
+        # without.
         relabel=RelabelConfig(share=0.25, planner_policy=False, corrected=False),
         # The policy learns to avoid by itself; shielded steps are lost to it.
         shield=ShieldConfig(mode="off"),

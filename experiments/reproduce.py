@@ -19,6 +19,7 @@ from rich.console import Console
 
 from experiments.command import parse_flags
 from experiments.errors import Interrupted, UserError, main_guard
+from experiments.options import RECIPES
 from experiments.paper.panels import (
     NUM_SEEDS,
     PANELS,
@@ -48,7 +49,7 @@ class ReproduceFlags:
     only: tuple[str, ...] = ()
     """Figures, such as letter-set1, walk-ablation or walk-trajectories, or walk-tuning and its like; all figures if not
     given."""
-    recipes: tuple[str, ...] = ("paper", "hrlspec")
+    recipes: tuple[str, ...] = RECIPES
     """Whose curves."""
     seeds: int = NUM_SEEDS
     """Runs of each curve, seeds 0, 1, ... One for tuning."""
@@ -102,7 +103,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     from experiments.paper.report import write_report
 
     # The page is about all that is known, whatever was asked for now.
-    known = dataclasses.replace(flags, recipes=("paper", "hrlspec"), seeds=max(flags.seeds, NUM_SEEDS))
+    known = dataclasses.replace(flags, recipes=RECIPES, seeds=max(flags.seeds, NUM_SEEDS))
     every = _runs([*PANELS.values(), *TUNING.values()], known)
     records = {run: record for run in every if (record := read_run(run, flags.out)) is not None}
     for file in write_report(panels, records, flags.out, flags.report):
@@ -118,7 +119,7 @@ def _chosen(flags: ReproduceFlags) -> list[Panel]:
         if value is not None and value < 1:
             raise UserError(f"--{name} is {value}, expected at least 1")
     for recipe in flags.recipes:
-        if recipe not in ("paper", "hrlspec"):
+        if recipe not in RECIPES:
             raise UserError(f"--recipes {recipe}: there is no such recipe, expected paper, hrlspec or both")
     if not flags.only:
         return list(PANELS.values())

@@ -78,7 +78,6 @@ def _run(experiment: Experiment, folder: Path, resume: bool, flags: RunFlags, co
     with open_run(folder, experiment, resume=resume) as run:
         job = learner.job()
         total = job.num_iterations * job.steps_per_iteration
-        begin = 0
         with ProgressDisplay(total, experiment.name) as display:
             loop = Loop(job, run, display, checkpoint_seconds=60 * flags.checkpoint_minutes)
             state = loop.restore()

@@ -58,9 +58,9 @@ class NetworkConfig:
     """How many of the sub-tasks completed last the low level remembers: where a reward depends on their order, what the
     rest of the task is worth depends on them."""
     whole_task: bool = False
-    """Whether the low level is told the whole remaining task, with what each edge forbids, instead of a sub-task: one flat
-    policy and no planner (the baseline LTL2Action). Then ``task_rounds`` and ``memory`` are
-    0, and roles and advice are off."""
+    """Whether the low level is told the whole remaining task, with what each edge forbids, instead of a sub-task: one
+    flat policy and no planner (the baseline LTL2Action). Then ``task_rounds`` and ``memory`` are 0, and roles and
+    advice are off."""
     child_embeddings: bool = False
     """Whether the planner's logit of an edge also sees the embedding of the node it leads to."""
     advice: float = 0.0

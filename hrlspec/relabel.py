@@ -40,6 +40,11 @@ class Record:
     reach: jax.Array
     avoid: jax.Array
 
+    @property
+    def first(self) -> jax.Array:
+        """Whether the step is the first of its episode in the rollout, bool ``[T]``."""
+        return jnp.concatenate([jnp.ones(1, bool), self.slot[1:] != self.slot[:-1]])
+
 
 @struct.dataclass
 class Relabelled:
@@ -73,7 +78,6 @@ def visits(record: Record) -> Record:
     ``ensuring`` part where it was the one completed on purpose. What nobody asked for is learned as well: without it,
     a region found too rarely is forgotten before it is learned.
     """
-    first = jnp.concatenate([jnp.ones(1, bool), record.slot[1:] != record.slot[:-1]])
 
     def step(seen: jax.Array, inputs: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         labels, taken, reach, avoid, first = inputs
@@ -84,7 +88,7 @@ def visits(record: Record) -> Record:
         goal = jnp.where(intended, reach, found) & new.any()
         return jnp.where(new.any(), labels, seen), (new.any(), goal, avoid & intended)
 
-    inputs = (record.labels, record.edge_taken, record.reach, record.avoid, first)
+    inputs = (record.labels, record.edge_taken, record.reach, record.avoid, record.first)
     taken, reach, avoid = jax.lax.scan(step, jnp.zeros(record.labels.shape[1:], bool), inputs)[1]
     return Record(slot=record.slot, labels=record.labels, edge_taken=taken, reach=reach, avoid=avoid)
 
@@ -127,8 +131,7 @@ def relabel(
 
     slot = jnp.minimum(record.slot, num_slots - 1)
     valid = (record.slot < num_slots) & ~held_out[slot] & (done_before < length[slot])
-    first = jnp.concatenate([jnp.ones(1, bool), record.slot[1:] != record.slot[:-1]])
-    decided = valid & (first | jnp.concatenate([jnp.zeros(1, bool), record.edge_taken[:-1]]))
+    decided = valid & (record.first | jnp.concatenate([jnp.zeros(1, bool), record.edge_taken[:-1]]))
     terminated = valid & record.edge_taken & (done_before + 1 == length[slot])
 
     def pay(rules: jax.Array, step: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
@@ -136,7 +139,7 @@ def relabel(
         rules = jnp.where(first, rewards.initial(machine), rules)
         return rewards.step(machine, rules, labels, reached, taken, completed)
 
-    steps = (record.labels, record.reach, record.edge_taken & valid, terminated, first)
+    steps = (record.labels, record.reach, record.edge_taken & valid, terminated, record.first)
     reward = jax.lax.scan(pay, rewards.initial(machine), steps)[1]
     return Relabelled(
         tree=tree,
@@ -153,8 +156,7 @@ def relabel(
 def _completed_before(record: Record) -> jax.Array:
     """How many sub-tasks its episode had completed before each step, int32 ``[T]``."""
     total = jnp.cumsum(record.edge_taken) - record.edge_taken
-    first = jnp.concatenate([jnp.ones(1, bool), record.slot[1:] != record.slot[:-1]])
-    return (total - jax.lax.cummax(jnp.where(first, total, 0))).astype(jnp.int32)
+    return (total - jax.lax.cummax(jnp.where(record.first, total, 0))).astype(jnp.int32)
 
 
 def _path(

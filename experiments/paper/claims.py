@@ -69,7 +69,7 @@ CLAIMS = (
     Claim("Ours ends with a better return than LTL2Action", _FIRST + _SECOND, _OURS, ("ltl2action", ()), final_return),
     Claim("Ours ends with a better return than Option (set 1)", _FIRST, _OURS, ("option", ()), final_return),
     Claim("Ours ends with a better return than Option (set 2)", _SECOND, _OURS, ("option", ()), final_return),
-    Claim("Option learns faster than ours on Walk under reward set 1", ("walk-set1",), ("option", ()), _OURS, mean_return),
+    Claim("Option learns faster on Walk under reward set 1", ("walk-set1",), ("option", ()), _OURS, mean_return),
     Claim("Without future sub-tasks the low level learns less", _ABLATIONS, _OURS, ("myopic-low", ()), mean_return),
     Claim("Without future sub-tasks it ends with a lower return", _ABLATIONS, _OURS, ("myopic-low", ()), final_return),
     Claim("Without relabelling it learns less still", _ABLATIONS, ("myopic-low", ()), ("no-er", ()), mean_return),

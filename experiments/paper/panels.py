@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.errors import UserError
-from experiments.options import Method, Recipe, RewardSet
+from experiments.options import RECIPES, Method, Recipe, RewardSet
 from experiments.run_folder import read_metrics, read_record, read_summary
 
 ENVIRONMENTS = ("letter", "walk", "zone")
@@ -106,13 +106,12 @@ class Panel:
         return [Run(self.env, self.reward_set, curve, seed, steps) for seed in seeds for curve in self.curves]
 
 
-_RECIPES: tuple[Recipe, ...] = ("paper", "hrlspec")
 _COMPARED: tuple[Method, ...] = ("ours", "ltl2action", "option")
 _ABLATED: tuple[Method, ...] = ("ours", "myopic-low", "no-er")
 
 
 def _curves(methods: tuple[Method, ...]) -> tuple[Curve, ...]:
-    return tuple(Curve(method, recipe) for recipe in _RECIPES for method in methods)
+    return tuple(Curve(method, recipe) for recipe in RECIPES for method in methods)
 
 
 def _comparison(env: str, reward_set: RewardSet) -> Panel:
@@ -159,7 +158,7 @@ TRIED = {
 def _trials(env: str) -> tuple[Curve, ...]:
     return tuple(
         Curve(method, recipe, (f"--config.low.learning-rate={rate:g}",))
-        for recipe in _RECIPES
+        for recipe in RECIPES
         for method in _COMPARED
         for rate in TRIED[env, recipe]
     )

@@ -12,7 +12,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.options import Recipe
+from experiments.options import RECIPES
 from experiments.paper.claims import (
     CLAIMS,
     Record,
@@ -38,7 +38,11 @@ are Student's t intervals. All methods run through the same loop, with the same 
 relabelling. Recipe `paper` collects with the shield, also for Option; LTL2Action has no
 sub-task and so nothing to shield. Recipe `hrlspec` has no shield. Training times are of runs side by side, one on each
 core, with compilation and evaluations; a few include a pause or other programs beside them."""
-_RECIPES: tuple[Recipe, ...] = ("paper", "hrlspec")
+_ABOUT_CLAIMS = """\
+The share is the probability that a run of the one beats a run of the other: in the mean of its curve where the claim is
+about learning, in its final return where it is about the end. A claim holds, or does not, where the interval excludes a
+half. For those that do not, experiments that look for the reason are in `docs/decisions.md`, "Where claims do not
+hold"."""
 _FEWEST_FOR_BAND = 3
 """Student's t interval of two seeds is twelve times as wide as what they differ by."""
 
@@ -75,7 +79,7 @@ def _of_panel(panel: Panel, records: Mapping[Run, Record]) -> dict[Curve, list[R
 
 def _draw(panel: Panel, records: Records, file: Path) -> Iterator[Path]:
     """One axis for each recipe that has curves; PNG and SVG."""
-    recipes = [recipe for recipe in _RECIPES if any(curve.recipe == recipe for curve in records)]
+    recipes = [recipe for recipe in RECIPES if any(curve.recipe == recipe for curve in records)]
     figure = Figure(figsize=(0.5 + 4.5 * len(recipes), 3.6), layout="constrained")
     axes: Any = figure.subplots(1, len(recipes), squeeze=False, sharey=True)
     for ax, recipe in zip(axes[0], recipes, strict=True):
@@ -115,16 +119,13 @@ def _page(by_panel: Mapping[Panel, Records], figures: Path, report: Path) -> Ite
     yield ""
     yield "## The paper's claims"
     yield ""
-    yield "The share is the probability that a run of the one beats a run of the other: in the mean of its curve for what"
-    yield "is learned faster or less, in its final return for how it ends. A claim holds, or does not, where the interval"
-    yield "excludes a half. For claims that do not hold, experiments that look for the reason are in `docs/decisions.md`,"
-    yield '"Where claims do not hold".'
+    yield _ABOUT_CLAIMS
     yield ""
     yield "| claim | panel | recipe | share | seeds | verdict |"
     yield "|---|---|---|---|---|---|"
     for claim in CLAIMS:
         for name in claim.panels:
-            for recipe in _RECIPES:
+            for recipe in RECIPES:
                 found = finding(claim, recipe, by_panel.get(PANELS[name], {}))
                 if found is not None:
                     seeds = " and ".join(map(str, found.seeds))
@@ -157,12 +158,12 @@ def _times(by_panel: Mapping[Panel, Records]) -> Iterator[str]:
     yield "Training of all runs, one after the other, each on one core; two cores side by side take half of it. A curve"
     yield "that is in several panels counts in the first."
     yield ""
-    yield f"| panel | {' | '.join(f'recipe {recipe}' for recipe in _RECIPES)} |"
-    yield "|---" * (1 + len(_RECIPES)) + "|"
+    yield f"| panel | {' | '.join(f'recipe {recipe}' for recipe in RECIPES)} |"
+    yield "|---" * (1 + len(RECIPES)) + "|"
     counted: set[tuple[str, int, Curve]] = set()
     for panel, records in by_panel.items():
         cells = []
-        for recipe in _RECIPES:
+        for recipe in RECIPES:
             curves = [curve for curve in records if curve.recipe == recipe]
             new = [curve for curve in curves if (panel.env, panel.reward_set, curve) not in counted]
             runs = [record["wall_s"] for curve in new for record in records[curve]]
@@ -190,7 +191,7 @@ def _tuning(trials: Mapping[Panel, Records]) -> Iterator[str]:
 
 def _rows(records: Records) -> Iterator[str]:
     """A line for each curve; the ratio is of ours' steps to its own."""
-    ours = {recipe: records.get(Curve("ours", recipe)) for recipe in _RECIPES}
+    ours = {recipe: records.get(Curve("ours", recipe)) for recipe in RECIPES}
     fastest = {recipe: over_seeds(steps_to_most, some).estimate for recipe, some in ours.items() if some}
     for curve, some in records.items():
         steps = over_seeds(steps_to_most, some).estimate
@@ -209,4 +210,4 @@ def _rows(records: Records) -> Iterator[str]:
 def _mean(results: Sequence[Mapping[str, Any]], name: str, how: str = ".3f") -> str:
     """Interquartile mean; nothing where it is not known, as SPL is in Zone, whose optimum nobody knows."""
     values = [result.get(name) for result in results]
-    return "" if None in values else format(interquartile_mean(values), how)
+    return "" if None in values else format(interquartile_mean(np.array(values, float)), how)
