@@ -266,7 +266,7 @@ def zone_of_paper(config: Config) -> Config:
         # With coloured noise the policy learns to be random, not where to go.
         noise_correlation=0.0,
         low=dataclasses.replace(config.low, entropy=0.0, minibatches=32),
-        # With 32 it learned more slowly: so many tell the task of each environment apart from all others.
+        # With 32 it learned more slowly; so many may tell the task of each environment apart from all others.
         network=dataclasses.replace(config.network, task_features=8),
     )
 

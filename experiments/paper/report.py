@@ -35,9 +35,9 @@ return, where an exact planner knows it (suite `branches`); contested is contest
 takes the nearest instance. The ratio is of the steps that ours takes to 90 % of its curve's last value to those of the
 method. Figures are interquartile means over seeds (training: means) with stratified bootstrap intervals (95 %); bands
 are Student's t intervals. All methods run through the same loop, with the same curriculum and, but for No-ER,
-relabelling. Recipe `paper` collects with the shield, also for Option; LTL2Action has no
-sub-task and so nothing to shield. Recipe `hrlspec` has no shield. Training times are of runs side by side, one on each
-core, with compilation and evaluations; a few include a pause or other programs beside them."""
+relabelling. Recipe `paper` collects with the shield, also for Option; LTL2Action has no sub-task and so nothing to
+shield. Recipe `hrlspec` has no shield. Training times are of runs side by side, one on each core, with compilation and
+evaluations; a few include a pause or other programs beside them."""
 _ABOUT_CLAIMS = """\
 The share is the probability that a run of the one beats a run of the other: in the mean of its curve where the claim is
 about learning, in its final return where it is about the end. A claim holds, or does not, where the interval excludes a
@@ -167,7 +167,7 @@ def _times(by_panel: Mapping[Panel, Records]) -> Iterator[str]:
             curves = [curve for curve in records if curve.recipe == recipe]
             new = [curve for curve in curves if (panel.env, panel.reward_set, curve) not in counted]
             runs = [record["wall_s"] for curve in new for record in records[curve]]
-            cells.append(f"{len(runs)} {'run' if len(runs) == 1 else 'runs'}, {duration(sum(runs))}" if runs else "")
+            cells.append(f"{len(runs)} runs, {duration(sum(runs))}" if runs else "")
             counted |= {(panel.env, panel.reward_set, curve) for curve in new}
         yield f"| {panel.name} | {' | '.join(cells)} |"
 
