@@ -23,13 +23,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import envs_jax
-from experiments.platform import prepare
-from experiments.presets import preset, rewards_of
-from experiments.programs import Program
-from hrlspec.agent import Agent
-from hrlspec.curriculum import draw_bank
-from hrlspec.rollout import collect, fill_pool
-from hrlspec.training import Trainer
+from hrlspec.agent.agent import Agent
+from hrlspec.learning.rollout import collect, fill_pool
+from hrlspec.learning.train import Trainer
+from hrlspec.presets.settings import preset, rewards_of
+from hrlspec.run.platform import prepare
+from hrlspec.run.programs import Program
+from hrlspec.tasks.curriculum import draw_bank
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,8 +16,8 @@ import tyro
 
 import envs_jax
 from benchmarks import common
-from hrlspec.shortest_way import planned_steps
-from hrlspec.spec.sampling import sample_trees
+from hrlspec.exact.shortest_path import planned_steps
+from hrlspec.tasks.sampling import sample_trees
 
 
 @dataclasses.dataclass(frozen=True)

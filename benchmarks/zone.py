@@ -20,7 +20,7 @@ import tyro
 
 import envs_jax
 from benchmarks import common
-from envs_jax import zone_physics
+from envs_jax.zone import physics as zone_physics
 
 STEPS_A_CALL = 51_200
 """Environment steps in one call, over all environments, within the limits of `_num_steps`."""

@@ -11,8 +11,8 @@ from typing import Any
 
 from envs_jax.base import Box, Discrete, Environment, EnvParams, Reflections, Symmetries
 from envs_jax.layouts import load_layouts, save_layouts
-from envs_jax.letter import Letter, LetterState
-from envs_jax.walk import Walk, WalkLayout, WalkState, flatworld
+from envs_jax.letter.world import Letter, LetterState
+from envs_jax.walk.world import Walk, WalkLayout, WalkState, flatworld
 
 __all__ = [
     "Box",
@@ -35,7 +35,7 @@ __all__ = [
 
 def _zone(name: str, **overrides: Any) -> Environment:
     """A preset of Zone. Its module is imported when first asked for: the others are quick to start."""
-    from envs_jax.zone import PRESETS
+    from envs_jax.zone.world import PRESETS
 
     return PRESETS[name](**overrides)
 

@@ -17,9 +17,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from experiments.command import parse_flags
-from experiments.errors import Interrupted, UserError, main_guard
-from experiments.options import RECIPES
 from experiments.paper.panels import (
     NUM_SEEDS,
     PANELS,
@@ -33,9 +30,12 @@ from experiments.paper.panels import (
     trajectory_run,
     write_run,
 )
-from experiments.progress import duration
-from experiments.run_folder import read_metrics
-from experiments.signals import polled_signals
+from hrlspec.run.errors import Interrupted, UserError, main_guard
+from hrlspec.run.experiment import RECIPES
+from hrlspec.run.flags import parse_flags
+from hrlspec.run.folder import read_metrics
+from hrlspec.run.progress import duration
+from hrlspec.run.signals import polled_signals
 
 PROGRAM = "python -m experiments.reproduce"
 POLL_SECONDS = 2.0

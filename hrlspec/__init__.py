@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from hrlspec.agent import Agent
+from hrlspec.agent.agent import Agent
 from hrlspec.config import Config
 from hrlspec.evaluation.episodes import run_episodes, trace_episodes
-from hrlspec.rewards import Bonus, RewardMachine, reward_machine
+from hrlspec.learning.train import Trainer, TrainState
 from hrlspec.spec import compile, parse
-from hrlspec.training import Trainer, TrainState
+from hrlspec.tasks.rewards import Bonus, RewardMachine, reward_machine
 from hrlspec.version import __version__
 
 __all__ = [

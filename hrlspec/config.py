@@ -1,7 +1,7 @@
-"""Everything a run can be told, as frozen dataclasses; the tuned values live in ``experiments/presets.py``.
+"""Everything a run can be told, as frozen dataclasses; the tuned values live in ``hrlspec/presets``.
 
 All fields are static: they shape the compiled program. What may change inside a run (parameters, counters,
-curriculum level) lives in :class:`hrlspec.training.TrainState`.
+curriculum level) lives in :class:`hrlspec.learning.train.TrainState`.
 """
 
 from __future__ import annotations

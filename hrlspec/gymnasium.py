@@ -13,7 +13,7 @@ import gymnasium
 import envs_jax
 from envs_jax import Environment
 from envs_jax.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
-from hrlspec.text_tasks import TextTasks
+from hrlspec.tasks.text_tasks import TextTasks
 
 
 def make(env: str | Environment, *, task: str | None = None, max_nodes: int = 64, **overrides: Any) -> GymnasiumEnv:

@@ -6,7 +6,7 @@ import os
 
 import jax
 
-from experiments.platform import compiled_quickly, with_loop_option
+from hrlspec.run.platform import compiled_quickly, with_loop_option
 
 # Before the first array is made, so that tests and the processes they start run the same programs, to the bit.
 os.environ["XLA_FLAGS"] = compiled_quickly(with_loop_option(os.environ.get("XLA_FLAGS", ""), jax.__version_info__))

@@ -16,10 +16,10 @@ import numpy as np
 from flax import struct
 
 from envs_jax.base import Box, Discrete, Environment, EnvParams, StepResult
-from hrlspec.agent import Agent
+from hrlspec.agent.agent import Agent
 from hrlspec.config import Config, CurriculumConfig, NetworkConfig, PPOConfig, RelabelConfig, ShieldConfig
 from hrlspec.spec.tree import TaskTree
-from tests.tasks import tree_of
+from tests.trees import tree_of
 
 
 def probe_task(name: str, *, num_propositions: int, num_nodes: int) -> TaskTree:

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from experiments.options import Method, Recipe
 from experiments.paper.panels import Curve
-from hrlspec.stats import Interval, probability_of_improvement, stratified_bootstrap
+from hrlspec.evaluation.stats import Interval, probability_of_improvement, stratified_bootstrap
+from hrlspec.run.experiment import Method, Recipe
 
 Record = Mapping[str, Any]
 Records = Mapping[Curve, Sequence[Record]]

@@ -11,9 +11,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from experiments.errors import UserError
-from experiments.options import RECIPES, Method, Recipe, RewardSet
-from experiments.run_folder import read_metrics, read_record, read_summary
+from hrlspec.run.errors import UserError
+from hrlspec.run.experiment import RECIPES, Method, Recipe, RewardSet
+from hrlspec.run.folder import read_metrics, read_record, read_summary
 
 ENVIRONMENTS = ("letter", "walk", "zone")
 BUDGETS = {"letter": 1_500_000, "walk": 2_000_000, "zone": 4_000_000}

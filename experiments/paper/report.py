@@ -12,7 +12,6 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.options import RECIPES
 from experiments.paper.claims import (
     CLAIMS,
     Record,
@@ -24,8 +23,9 @@ from experiments.paper.claims import (
     steps_to_most,
 )
 from experiments.paper.panels import PANELS, TRAJECTORIES, TUNING, Curve, Panel, Run
-from experiments.progress import duration
-from hrlspec.stats import interquartile_mean, mean_interval
+from hrlspec.evaluation.stats import interquartile_mean, mean_interval
+from hrlspec.run.experiment import RECIPES
+from hrlspec.run.progress import duration
 
 _ABOUT = """\
 Written by `python -m experiments.reproduce` from the records in `results/paper`; each names the flags that made it.

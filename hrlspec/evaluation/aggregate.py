@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from hrlspec.evaluation.results import ESTIMATES, Score, SuiteResult, interval_to_json
-from hrlspec.stats import Interval, mean_interval, stratified_bootstrap
+from hrlspec.evaluation.stats import Interval, mean_interval, stratified_bootstrap
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,13 +14,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from hrlspec import solver
 from hrlspec.evaluation.suite import Suite
-from hrlspec.rewards import RewardMachine
-from hrlspec.shortest_way import has_grid, planned_steps
-from hrlspec.solver import tabulate
+from hrlspec.exact import solver
+from hrlspec.exact.reference_agents import branch_scores, myopic_steps
+from hrlspec.exact.shortest_path import has_grid, planned_steps
+from hrlspec.exact.solver import tabulate
 from hrlspec.spec import TaskTree
-from hrlspec.yardsticks import branch_scores, myopic_steps
+from hrlspec.tasks.rewards import RewardMachine
 
 LAYOUTS_PER_TASK = 10
 MOST_ROUNDS = 20
@@ -186,7 +186,7 @@ def make_branch_cases(
         machine: the rewards.
         layouts_per_task: layouts drawn for each task.
         seed: of the layouts.
-        least_difference: see :func:`hrlspec.yardsticks.branch_scores`.
+        least_difference: see :func:`hrlspec.exact.reference_agents.branch_scores`.
 
     Raises:
         ValueError: if the environment has no exact solver or no case is left.

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from hrlspec.agent import Agent, Params
-from hrlspec.interaction import act, decide, start, transition
-from hrlspec.rewards import RewardMachine
+from hrlspec.agent.agent import Agent, Params
+from hrlspec.agent.interaction import act, decide, start, transition
 from hrlspec.spec import TaskTree
+from hrlspec.tasks.rewards import RewardMachine
 
 
 @struct.dataclass

@@ -14,15 +14,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from hrlspec.agent import Agent, Params
-from hrlspec.contested import ContestedSuite, contested_suite
+from hrlspec.agent.agent import Agent, Params
 from hrlspec.evaluation.cases import LAYOUTS_PER_TASK, BranchCases, Cases, make_branch_cases, make_cases
 from hrlspec.evaluation.episodes import run_episodes, trace_episodes
 from hrlspec.evaluation.results import ChoiceResult, ReturnResult, SuiteResult
 from hrlspec.evaluation.scoring import score_choices, score_returns, score_suite
 from hrlspec.evaluation.suite import Suite
-from hrlspec.rewards import RewardMachine
+from hrlspec.exact.contested import ContestedSuite, contested_suite
 from hrlspec.spec import TaskTree
+from hrlspec.tasks.rewards import RewardMachine
 
 CHUNK = 500
 """Episodes run side by side unless told otherwise."""

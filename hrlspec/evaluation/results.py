@@ -1,6 +1,6 @@
 """What evaluations report, and its JSON form.
 
-Intervals cover 95 % and widen for episodes of one task being alike (:mod:`hrlspec.stats`).
+Intervals cover 95 % and widen for episodes of one task being alike (:mod:`hrlspec.evaluation.stats`).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from hrlspec.stats import Interval
+from hrlspec.evaluation.stats import Interval
 
 ESTIMATES = ("success_rate", "violation_rate", "return_mean", "steps_mean", "spl")
 """The estimates of a :class:`Score`; each has ``<name>_interval`` beside it in JSON."""

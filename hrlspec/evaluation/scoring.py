@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from hrlspec.contested import ContestedSuite
 from hrlspec.evaluation.cases import BranchCases, Cases
 from hrlspec.evaluation.episodes import Episodes
 from hrlspec.evaluation.results import ChoiceResult, ReturnResult, Score, SuiteResult, TaskScore
-from hrlspec.stats import Interval, mean_interval, rate_interval
+from hrlspec.evaluation.stats import Interval, mean_interval, rate_interval
+from hrlspec.exact.contested import ContestedSuite
 
 
 def path_ratio(success: np.ndarray, taken: np.ndarray, optimum: np.ndarray) -> np.ndarray:

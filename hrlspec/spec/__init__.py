@@ -7,7 +7,6 @@ from hrlspec.spec.draw import draw_task
 from hrlspec.spec.hashing import task_hash, task_hashes
 from hrlspec.spec.monitor import RUNNING, SATISFIED, VIOLATED, TaskState, advance, initial, open_edges
 from hrlspec.spec.parser import parse
-from hrlspec.spec.sampling import sample_sequences, sample_trees
 from hrlspec.spec.semantics import satisfies
 from hrlspec.spec.subtasks import Subtask, subtasks
 from hrlspec.spec.syntax import (
@@ -26,6 +25,7 @@ from hrlspec.spec.syntax import (
 )
 from hrlspec.spec.text import to_text, tree_to_formula, tree_to_text
 from hrlspec.spec.tree import TaskTree, subtask_avoid
+from hrlspec.tasks.sampling import sample_sequences, sample_trees
 
 __all__ = [
     "RUNNING",

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from envs_jax import Letter, Walk
-from hrlspec.text_tasks import TextTasks
+from hrlspec.tasks.text_tasks import TextTasks
 from tests.probes import Corridor, quick_jit
 
 with warnings.catch_warnings():

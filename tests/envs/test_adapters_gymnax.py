@@ -9,12 +9,12 @@ import pytest
 
 from envs_jax import Letter, Walk
 from envs_jax.adapters.gymnax import GymnaxEnv
-from hrlspec import rewards
-from hrlspec.rewards import Bonus
 from hrlspec.spec import RUNNING, SATISFIED, VIOLATED, tree_to_text
-from hrlspec.text_tasks import TextTasks
+from hrlspec.tasks import rewards
+from hrlspec.tasks.rewards import Bonus
+from hrlspec.tasks.text_tasks import TextTasks
 from tests.probes import Corridor, pairs, quick_jit, read_monitor
-from tests.tasks import random_tree
+from tests.trees import random_tree
 
 LEFT, RIGHT = 0, 1
 CORRIDOR = Corridor(starts=(2,))

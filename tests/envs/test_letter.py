@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 import envs_jax
-from envs_jax import letter_render
+from envs_jax.letter import render as letter_render
 from tests.probes import quick_jit
 
 

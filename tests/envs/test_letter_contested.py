@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 import envs_jax
-from envs_jax.letter_contested import FAR, most_contested, myopia_regret
+from envs_jax.letter.contested import FAR, most_contested, myopia_regret
 from tests.probes import quick_jit
 
 ENV = envs_jax.make("letter", size=5, num_letters=3, num_cells=6)

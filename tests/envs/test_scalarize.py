@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs_jax.scalarize import CannotScalarizeError, scalarize
+from envs_jax.zone.scalarize import CannotScalarizeError, scalarize
 
 MATRIX = np.array([[0.0, 1.0, 0.0], [2.0, 0.0, -1.0], [0.0, 0.0, 0.0]], np.float32)
 

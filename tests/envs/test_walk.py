@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 import envs_jax
-from envs_jax import Walk, WalkLayout, load_layouts, save_layouts, walk_render
-from envs_jax.walk import FLATWORLD_DISCS, NO_DISC, PAPER_DISCS
+from envs_jax import Walk, WalkLayout, load_layouts, save_layouts
+from envs_jax.walk import render as walk_render
+from envs_jax.walk.world import FLATWORLD_DISCS, NO_DISC, PAPER_DISCS
 
 
 def _layout(env: Walk, seed: int = 0) -> WalkLayout:

@@ -12,9 +12,9 @@ import pytest
 from scipy import stats
 
 import envs_jax
-from envs_jax.zone import BOUNDARY, PRESETS, Zone
-from envs_jax.zone_contested import contested_layout
-from envs_jax.zone_layouts import ZoneLayout
+from envs_jax.zone.contested import contested_layout
+from envs_jax.zone.layouts import ZoneLayout
+from envs_jax.zone.world import BOUNDARY, PRESETS, Zone
 
 # These need no MuJoCo: the two kinds of physics are compared in test_zone_physics.
 ENV = PRESETS["zone"](physics="closed-form")

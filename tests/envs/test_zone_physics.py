@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs_jax import zone_physics
-from envs_jax.zone import PRESETS, ZoneState, lidar_readings
-from envs_jax.zone_layouts import ZoneLayout
+from envs_jax.zone import physics as zone_physics
+from envs_jax.zone.layouts import ZoneLayout
+from envs_jax.zone.world import PRESETS, ZoneState, lidar_readings
 
 mujoco, _ = zone_physics.import_mjx()
 

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs_jax.letter import MOVES
-from hrlspec.agent import Agent, Params, View
-from hrlspec.networks.controller import Instruction
+from envs_jax.letter.world import MOVES
+from hrlspec.agent.agent import Agent, Params, View
+from hrlspec.agent.networks.controller import Instruction
 from hrlspec.spec import TaskState, TaskTree, open_edges, subtask_avoid
 
 FAR = 1e4

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import envs_jax
-from hrlspec import solver
 from hrlspec.evaluation import make_branch_cases, make_cases, suite_from_text
 from hrlspec.evaluation.cases import draw_layouts, task_of
-from hrlspec.rewards import reward_machine
+from hrlspec.exact import solver
+from hrlspec.tasks.rewards import reward_machine
 
 LETTER = envs_jax.make("letter")
 HURRY = envs_jax.make("letter", horizon=6)

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 import envs_jax
-from envs_jax.letter import Letter
-from hrlspec.agent import Agent, Params
+from envs_jax.letter.world import Letter
+from hrlspec.agent.agent import Agent, Params
 from hrlspec.config import Config, NetworkConfig
-from hrlspec.contested import contested_suite
 from hrlspec.evaluation import (
     ChoiceEvaluation,
     Suite,
@@ -27,8 +26,9 @@ from hrlspec.evaluation import (
     suite_from_text,
     suite_from_trees,
 )
-from hrlspec.rewards import reward_machine
-from hrlspec.spec import sample_sequences
+from hrlspec.exact.contested import contested_suite
+from hrlspec.tasks.rewards import reward_machine
+from hrlspec.tasks.sampling import sample_sequences
 from tests.evaluation.scripted import Walker, manner
 
 LETTER = envs_jax.make("letter")

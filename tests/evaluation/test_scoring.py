@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import envs_jax
-from hrlspec.contested import ContestedSuite
 from hrlspec.evaluation import BranchCases, Cases, Score, SuiteResult, aggregate, suite_from_text
 from hrlspec.evaluation.episodes import Episodes
 from hrlspec.evaluation.scoring import path_ratio, score_choices, score_returns, score_suite
-from hrlspec.stats import Interval, interquartile_mean, mean_interval, rate_interval
+from hrlspec.evaluation.stats import Interval, interquartile_mean, mean_interval, rate_interval
+from hrlspec.exact.contested import ContestedSuite
 
 SUITE = suite_from_text("two", "achieve a\nachieve b; achieve c", envs_jax.make("letter").propositions)
 TASK = np.array([0, 0, 1, 1])

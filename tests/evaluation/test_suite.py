@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from hrlspec.evaluation import suite_from_text, suite_from_trees
-from hrlspec.spec import SpecError, sample_trees
+from hrlspec.spec import SpecError
+from hrlspec.tasks.sampling import sample_trees
 
 LETTERS = ("a", "b", "c", "d", "e")
 

@@ -18,8 +18,6 @@ import pytest
 
 import envs_jax
 from experiments import reproduce
-from experiments.errors import Interrupted, UserError
-from experiments.options import Experiment, Method, Recipe, experiment_of, experiments_of, parse_run
 from experiments.paper.claims import (
     CLAIMS,
     Claim,
@@ -45,10 +43,12 @@ from experiments.paper.panels import (
     write_run,
 )
 from experiments.paper.report import write_report
-from experiments.presets import preset
 from hrlspec import compile, parse
 from hrlspec.config import PPOConfig, ShieldConfig
-from tests.experiments.tiny import arguments
+from hrlspec.presets.settings import preset
+from hrlspec.run.errors import Interrupted, UserError
+from hrlspec.run.experiment import Experiment, Method, Recipe, experiment_of, experiments_of, parse_run
+from tests.run.tiny import arguments
 
 KEPT = Path(__file__).parents[2] / "results" / "paper"
 

@@ -1,0 +1,1 @@
+"""Letter: the world, its contested layouts and its pictures."""

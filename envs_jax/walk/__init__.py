@@ -1,0 +1,1 @@
+"""Walk: the world, its contested layouts and its pictures."""

@@ -1,0 +1,1 @@
+"""Zone: the world, its contested layouts and its pictures."""

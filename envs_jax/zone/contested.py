@@ -1,0 +1,177 @@
+"""Layouts of Zone that tell an agent that looks ahead from one that takes the nearest zone.
+
+The task they are for is "first colour, then second". On a contested layout the nearer zone of the first colour lies
+away from the only goal that is close to the other one, so that starting with the nearest makes the whole way longer.
+On its mirrored control both zones of the first colour are reflected through the robot: now the nearer one is right.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from envs_jax.zone.layouts import COLOURS, MOST_DRAWS, NUM_ZONES, SPAWN, ZONE_KEEPOUT, ZONES_EACH, ZoneLayout
+
+ROBOT_WITHIN = 0.3
+"""The robot starts this close to the middle along each axis (m)."""
+GOAL_DISTANCE = (1.8, 2.4)
+BETTER_SHARE = (0.5, 0.7)
+"""Where the better first zone lies on the straight way to the goal, as a share of it."""
+NEARER_DISTANCE = (0.8, 1.2)
+APART = 1.0
+"""Least distance between any two zones (m)."""
+LEAST_DETOUR = 0.5
+"""How much longer the way over the worse first zone is at least (m)."""
+CLEARANCE = 0.55
+"""Least distance of the other zones from the straight ways between robot, first zones and goal (m)."""
+
+_MOST_TURN = 0.5
+"""The nearer zone is not exactly opposite the goal, but within this angle of it (rad)."""
+_NEARER_BY = 0.1
+"""The nearer zone is nearer by this much at least (m)."""
+_GEOMETRIES = 128
+"""Draws of the contest at once; a valid one is among them 99 % of the time."""
+_REACH = SPAWN - ZONE_KEEPOUT
+_REST = NUM_ZONES - 3
+"""Zones besides the contest's own."""
+_NOWHERE = 1e6
+"""Coordinates of what is not placed yet: far from everything."""
+
+
+@struct.dataclass
+class _Core:
+    """What the contest is about."""
+
+    robot: jax.Array  # [2]
+    better: jax.Array  # [2], of the first colour
+    nearer: jax.Array  # [2], of the first colour
+    goal: jax.Array  # [2], of the second colour
+
+
+def contested_layout(
+    key: jax.Array,
+    first: jax.Array | int,
+    second: jax.Array | int,
+    *,
+    mirrored: jax.Array | bool = False,
+    needed: jax.Array | bool = True,
+) -> ZoneLayout:
+    """A random contested layout, or with the same key its mirrored control. The key is consumed.
+
+    Args:
+        key: decides everything but the colours and the reflection.
+        first: int ``[]``, index of the colour to go to first.
+        second: int ``[]``, index of the colour to go to then; another one.
+        mirrored: bool ``[]``, whether the control is wanted.
+        needed: bool ``[]``; where false, no layout is drawn and what is returned means nothing.
+
+    Returns:
+        The layout. ``zones[first, 0]`` is the better zone of the first colour, ``zones[first, 1]`` the other, and
+        ``zones[second, 0]`` the goal; so the nearer zone of the first colour is number 1, or 0 on the control.
+    """
+
+    def attempt(carry: tuple[jax.Array, _Core, jax.Array, jax.Array]) -> tuple[jax.Array, _Core, jax.Array, jax.Array]:
+        key, core_key, rest_key = jax.random.split(carry[0], 3)
+        core, found = _draw_core(core_key)
+        rest, placed = _draw_rest(rest_key, core)
+        return key, core, rest, found & placed
+
+    heading_key, key = jax.random.split(key)
+    heading = jax.random.uniform(heading_key, (), maxval=2 * jnp.pi)
+    nowhere = jnp.zeros(2)
+    start = (key, _Core(nowhere, nowhere, nowhere, nowhere), jnp.zeros((_REST, 2)), ~jnp.bool_(needed))
+    _, core, rest, _ = jax.lax.while_loop(lambda carry: ~carry[3], attempt, start)
+
+    pair = jnp.stack([core.better, core.nearer])
+    reflected = 2 * core.robot - pair[::-1]
+    index = jnp.arange(len(COLOURS))
+    other = (index != first) & (index != second)
+    zones = rest[1:].reshape(-1, ZONES_EACH, 2)[jnp.clip(jnp.cumsum(other) - 1, 0, 1)]
+    zones = jnp.where((index == first)[:, None, None], jnp.where(mirrored, reflected, pair), zones)
+    zones = jnp.where((index == second)[:, None, None], jnp.stack([core.goal, rest[0]]), zones)
+    return ZoneLayout(robot=jnp.concatenate([core.robot, heading[None]]), zones=zones)
+
+
+def _draw_core(key: jax.Array) -> tuple[_Core, jax.Array]:
+    """Robot, goal and the two zones of the first colour, and whether a valid draw was found (bool ``[]``)."""
+    # All numbers in one draw, for one call of the generator: it is what drawing a layout costs.
+    unit = jax.random.uniform(key, (_GEOMETRIES, 7))
+
+    def between(column: int, limits: tuple[float, float]) -> jax.Array:
+        return limits[0] + (limits[1] - limits[0]) * unit[:, column]
+
+    robot = ROBOT_WITHIN * (2 * unit[:, :2] - 1)
+    distance, nearer = between(2, GOAL_DISTANCE), between(3, NEARER_DISTANCE)
+    better = distance * between(4, BETTER_SHARE)
+    angle = between(5, (0.0, 2 * np.pi))
+    turned = angle + between(6, (-_MOST_TURN, _MOST_TURN))
+    ahead = jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)
+    back = -jnp.stack([jnp.cos(turned), jnp.sin(turned)], -1)
+    core = _Core(
+        robot=robot,
+        better=robot + better[:, None] * ahead,
+        nearer=robot + nearer[:, None] * back,
+        goal=robot + distance[:, None] * ahead,
+    )
+    # The control must do as well, so its zones keep their distances too.
+    zones = jnp.stack([core.better, core.nearer, *_reflected(core)])
+    valid = (_distance(zones, core.goal) >= APART).all(0) & (nearer + _NEARER_BY <= better)
+    valid &= (jnp.abs(zones) <= _REACH).all((0, 2)) & (jnp.abs(core.goal) <= _REACH).all(-1)
+    best = jnp.argmax(valid)
+    return jax.tree.map(lambda x: x[best], core), valid.any()
+
+
+def _draw_rest(key: jax.Array, core: _Core) -> tuple[jax.Array, jax.Array]:
+    """The other zone of the second colour and those of the other two colours ``[5, 2]``, and whether all found a place.
+
+    They keep away from the first zones' reflections as well, so that a contested layout and its control share them.
+    """
+    near, far = _reflected(core)
+    core_zones = jnp.stack([core.goal, core.better, core.nearer, near, far])
+    draws = jax.random.uniform(key, (_REST, MOST_DRAWS, 2), minval=-_REACH, maxval=_REACH)
+
+    def place(placed: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        index, candidates = inputs
+        free = (index > 0) | _is_contested(core, candidates)
+        for zones in (placed, core_zones):
+            free &= (_distance(candidates[:, None], zones) >= 2 * ZONE_KEEPOUT).all(-1)
+        for end in (core.goal, core.nearer, far):
+            free &= _distance_to_way(candidates, core.robot, end) >= CLEARANCE
+        found = candidates[jnp.argmax(free)]
+        return jnp.where((np.arange(_REST) == index)[:, None], found, placed), (found, free.any())
+
+    nothing = jnp.full((_REST, 2), _NOWHERE)
+    _, (rest, found) = jax.lax.scan(place, nothing, (jnp.arange(_REST), draws))
+    return rest, found.all()
+
+
+def _is_contested(core: _Core, other_goal: jax.Array) -> jax.Array:
+    """Whether the better zone makes the whole way shorter here and on the control; bool ``[...]`` for ``[..., 2]``."""
+
+    def way(over: jax.Array) -> jax.Array:
+        onward = jnp.minimum(_distance(over, core.goal), _distance(over, other_goal))
+        return _distance(core.robot, over) + onward
+
+    near, far = _reflected(core)
+    return (way(core.better) + LEAST_DETOUR <= way(core.nearer)) & (way(near) + LEAST_DETOUR <= way(far))
+
+
+def _reflected(core: _Core) -> tuple[jax.Array, jax.Array]:
+    """The first zones of the control: the nearer one, now on the goal's side, and the other."""
+    return 2 * core.robot - core.nearer, 2 * core.robot - core.better
+
+
+def _distance(left: jax.Array, right: jax.Array) -> jax.Array:
+    # Not as a sum over the last axis: short reductions are slow on a CPU.
+    dx, dy = left[..., 0] - right[..., 0], left[..., 1] - right[..., 1]
+    return jnp.sqrt(dx * dx + dy * dy)
+
+
+def _distance_to_way(points: jax.Array, start: jax.Array, end: jax.Array) -> jax.Array:
+    """Distance of points ``[..., 2]`` from a straight way."""
+    along, offset = end - start, points - start
+    projected = offset[..., 0] * along[0] + offset[..., 1] * along[1]
+    share = jnp.clip(projected / (along[0] ** 2 + along[1] ** 2), 0.0, 1.0)
+    return _distance(offset, share[..., None] * along)

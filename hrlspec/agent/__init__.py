@@ -1,0 +1,1 @@
+"""The agent: networks, distributions, and the pure functions that act with them."""

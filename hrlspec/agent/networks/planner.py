@@ -1,0 +1,113 @@
+"""The implicit planner: high-level policy and value over the remaining task (paper, "High-level Module").
+
+Axes: **N** tree nodes, **P** atomic propositions, **F** features.
+"""
+
+from __future__ import annotations
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from hrlspec.agent.networks.encoder import MLP, Encoder, initializer
+from hrlspec.agent.networks.tree import sum_to_parents, sweep_up
+from hrlspec.config import NetworkConfig
+from hrlspec.spec import TaskState, TaskTree, open_edges, subtask_avoid
+
+MASKED = -1e9
+
+
+class Planner(nn.Module):
+    """Encoder E, latent transition model T, tree GNN (M, U), policy and value, trained end to end."""
+
+    config: NetworkConfig
+
+    def setup(self) -> None:
+        """Declares the parts under the paper's names."""
+        c = self.config
+        features = c.planner_features
+        self.encoder = Encoder(c.latent, c.conv_channels, c.encoder_mlp)
+        self.transition = MLP((c.planner_hidden, c.planner_hidden, c.latent), final_scale=0.1)
+        self.project = nn.Dense(features, kernel_init=initializer(1.0))
+        self.message = MLP((features, features))
+        self.update = MLP((features, features))
+        self.normalise = nn.LayerNorm(use_bias=False, use_scale=False)
+        self.policy = MLP((*c.planner_policy, 1), final_scale=0.01)
+        self.value = MLP((c.planner_hidden, c.planner_hidden, 1), tanh=True, final_scale=1.0)
+
+    def encode(self, view: tuple[jax.Array, jax.Array]) -> jax.Array:
+        """Latent of one observation, float32 ``[latent]``."""
+        return self.encoder(*view)
+
+    def predict(self, latent: jax.Array, reach: jax.Array) -> jax.Array:
+        """Latent after completing a sub-task, ``h + T(h, p₊)``."""
+        return latent + self.transition(jnp.concatenate([latent, reach.astype(latent.dtype)], -1))
+
+    def latent_tree(self, latent: jax.Array, tree: TaskTree, root: jax.Array) -> jax.Array:
+        """Forward pass: predicted latents of every node below ``root``, ``[N, latent]``; meaningless elsewhere.
+
+        Nodes come in topological order, so each is computed once, from its parent.
+        """
+
+        def expand(self: Planner, latents: jax.Array, node: jax.Array) -> tuple[jax.Array, None]:
+            child = self.predict(latents[tree.parent[node]], tree.reach[node])
+            return latents.at[node].set(jnp.where(node == root, latent, child)), None
+
+        scan = nn.scan(expand, variable_broadcast="params", split_rngs={"params": False})
+        return scan(self, jnp.zeros((tree.num_nodes, latent.shape[-1])), jnp.arange(tree.num_nodes))[0]
+
+    def embed(self, latents: jax.Array, tree: TaskTree, state: TaskState) -> jax.Array:
+        """Backward pass: messages flow from children to parents over reversed edges (eq. 3), ``[N, F]``.
+
+        A blocked edge sends no message.
+        """
+        goal = tree.reach.astype(jnp.float32)
+        edge = jnp.concatenate([goal, subtask_avoid(tree).astype(jnp.float32)], -1)
+        sends = tree.valid & (tree.parent >= 0) & ~state.blocked
+        x = self.project(latents)
+        if not self.config.planner_rounds:
+
+            def visit(self: Planner, incoming: jax.Array, node: jax.Array) -> tuple[jax.Array, jax.Array]:
+                parent = tree.parent[node]
+                here = self.update(jnp.concatenate([x[node], goal[node], incoming[node]]))
+                sent = jnp.concatenate([here, goal[node], x[parent], goal[parent], edge[node]])
+                return incoming.at[parent].add(self.message(sent) * sends[node]), here
+
+            return sweep_up(visit, self, jnp.zeros_like(x))
+        for _ in range(self.config.planner_rounds):
+            x = jnp.concatenate([x, goal], -1)
+            incoming = self.message(jnp.concatenate([x, x[tree.parent], edge], -1))
+            x = self.update(jnp.concatenate([x, sum_to_parents(incoming, tree.parent, sends)], -1))
+            # The rounds share their weights: what grows in one grows in all, at first to a hundredfold.
+            x = self.normalise(x)
+        return x
+
+    def __call__(
+        self, view: tuple[jax.Array, jax.Array], tree: TaskTree, state: TaskState, advice: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Chooses among the open edges and estimates the return of the remaining task.
+
+        Args:
+            view: the observation, as ``env.proposition_view`` gives it.
+            tree: the task.
+            state: where it stands.
+            advice: float32 ``[N]``, the low level's value of each edge's sub-task; zeros when not used.
+
+        Returns:
+            Logits ``[N]`` (``MASKED`` where infeasible) and the value ``[]``.
+        """
+        latent = self.encode(view)
+        embeddings = self.embed(self.latent_tree(latent, tree, state.node), tree, state)
+        root = embeddings[state.node]
+        feasible = open_edges(tree, state)
+        inputs = [jnp.broadcast_to(root, embeddings.shape), tree.reach, subtask_avoid(tree)]
+        if self.config.child_embeddings:
+            inputs.append(embeddings)
+        # The advice counts relative to the best candidate's, which is also the first guess of the value.
+        best = jnp.where(feasible.any(), jnp.where(feasible, advice, -jnp.inf).max(), 0.0)
+        behind = jnp.where(feasible, self.config.advice * (advice - best), 0.0)
+        if self.config.advice:
+            inputs.append(behind[:, None])
+        logits = self.policy(jnp.concatenate([x.astype(jnp.float32) for x in inputs], -1))[:, 0] + behind
+        value = self.value(root)[0] + best
+        return jnp.where(feasible, logits, MASKED), value

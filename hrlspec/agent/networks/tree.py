@@ -1,0 +1,148 @@
+"""Message passing from children to parents, and the low level's embedding of remaining tasks.
+
+Axes: **N** tree nodes, **P** atomic propositions, **F** features.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from hrlspec.agent.networks.encoder import initializer
+from hrlspec.spec import TaskTree
+
+
+def sum_to_parents(messages: jax.Array, parent: jax.Array, sends: jax.Array) -> jax.Array:
+    """Sum of the messages ``[N, F]`` that arrive at each node, ``[N, F]``; nodes where ``sends`` is false send none."""
+    return jnp.zeros_like(messages).at[parent].add(jnp.where(sends[:, None], messages, 0.0))
+
+
+def sweep_up(visit: Callable[..., Any], module: nn.Module, carry: Any) -> Any:
+    """Visits the nodes from the last to the root, so that children come before their parents.
+
+    The messages of a node are then complete when it is visited: one visit a node does what as many rounds as
+    the tree is deep would do, at a fraction of the arithmetic, and look-ahead has no limit.
+
+    Args:
+        visit: ``(module, carry, node) -> (carry, output)``; ``carry`` holds the messages, leading axis N.
+        module: whose parameters ``visit`` uses.
+        carry: messages before the first visit.
+
+    Returns:
+        The outputs, leading axis N.
+    """
+    num_nodes = jax.tree.leaves(carry)[0].shape[0]
+    scan = nn.scan(visit, variable_broadcast="params", split_rngs={"params": False}, reverse=True)
+    return scan(module, carry, jnp.arange(num_nodes))[1]
+
+
+def lookahead(tree: TaskTree, depth: int) -> jax.Array:
+    """What may be reached 1, 2, ... sub-tasks after each node, over all branches, bool ``[N, depth, P]``."""
+    ahead = []
+    reach = tree.reach.astype(jnp.float32)
+    for _ in range(depth):
+        reach = sum_to_parents(reach, tree.parent, tree.valid & (tree.parent >= 0))
+        ahead.append(reach > 0)
+    return jnp.stack(ahead, 1) if ahead else jnp.zeros((tree.num_nodes, 0, tree.num_propositions), bool)
+
+
+def lookback(tree: TaskTree, depth: int) -> jax.Array:
+    """What was reached 1, 2, ... sub-tasks before each edge, bool ``[N, depth, P]``; nothing before the first."""
+    behind = []
+    node = tree.parent
+    for _ in range(depth):
+        behind.append(tree.reach[node] & (node >= 0)[:, None])
+        node = jnp.where(node >= 0, tree.parent[node], node)
+    return jnp.stack(behind, 1) if behind else jnp.zeros((tree.num_nodes, 0, tree.num_propositions), bool)
+
+
+def routes(tree: TaskTree, node: jax.Array, length: int) -> jax.Array:
+    """The way from ``node`` to every node below it: its first ``length`` nodes, int32 ``[N, length]``.
+
+    ``NO_NODE`` stands where the way has ended, and everywhere for nodes that are not below.
+    """
+    place = jnp.arange(length)
+    nothing = jnp.full((tree.num_nodes, length), TaskTree.NO_NODE, jnp.int32)
+
+    def climb(_: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        here, way = carry
+        steps = tree.depth[here] - tree.depth[node] - 1
+        way = jnp.where(place == steps[:, None], here[:, None], way)
+        return jnp.where(tree.parent[here] >= 0, tree.parent[here], here), way
+
+    start = jnp.arange(tree.num_nodes, dtype=jnp.int32)
+    _, way = jax.lax.fori_loop(0, tree.depth.max() + 1, climb, (start, nothing))
+    below = tree.valid & (tree.parent[way[:, 0]] == node) & (way[:, 0] >= 0)
+    return jnp.where(below[:, None], way, TaskTree.NO_NODE)
+
+
+class TaskEmbedding(nn.Module):
+    """GCN over a task tree with zero node features and p₊ on the edges (paper, "DAG Processing").
+
+    Information flows from children to parents alone, so one pass embeds every progression at once: row k is
+    the embedding of what remains after node k is reached. Weights are shared between rounds.
+
+    Attributes:
+        features: F.
+        rounds: rounds of message passing, or 0 for one sweep from the leaves to the root.
+        negatives: whether what an edge forbids by itself is on it too, as in LTL2Action.
+    """
+
+    features: int
+    rounds: int
+    negatives: bool = False
+
+    def setup(self) -> None:
+        """Declares the weights: of a node's own features, and of the message along an edge."""
+        self.own = nn.Dense(self.features, kernel_init=initializer(1.0))
+        self.message = nn.Dense(self.features, use_bias=False, kernel_init=initializer(1.0))
+        self.edge = nn.Dense(self.features, use_bias=False, kernel_init=initializer(1.0))
+
+    def __call__(self, tree: TaskTree) -> jax.Array:
+        """Embeds all progressions of one task, float32 ``[N, F]``."""
+        if not self.rounds:
+            return self._sweep(tree)[0]
+        sends = tree.valid & (tree.parent >= 0)
+        edge = self._edge(tree)
+        x = jnp.zeros((tree.num_nodes, self.features))
+        for _ in range(self.rounds):
+            x = nn.tanh(self.own(x) + sum_to_parents(nn.tanh(self.message(x) + edge), tree.parent, sends))
+        return x
+
+    def messages(self, tree: TaskTree) -> jax.Array:
+        """What the task beyond each edge has to say, float32 ``[N, F]``; `of_edges` reads it."""
+        return self._sweep(tree)[1]
+
+    def of_edges(self, messages: jax.Array, edges: jax.Array) -> jax.Array:
+        """Embeds the task that begins with some edges (bool ``[..., N]``) of one node, ``[..., F]``."""
+        return nn.tanh(self.own(jnp.zeros(self.features)) + (messages * edges[..., None]).sum(-2))
+
+    def _edge(self, tree: TaskTree) -> jax.Array:
+        parts = [tree.reach, tree.avoid] if self.negatives else [tree.reach]
+        return self.edge(jnp.concatenate(parts, -1).astype(jnp.float32))
+
+    def _sweep(self, tree: TaskTree) -> tuple[jax.Array, jax.Array]:
+        """Embeddings of all progressions, and the message sent along each edge, ``[N, F]`` each."""
+        sends = tree.valid & (tree.parent >= 0)
+        edge = self._edge(tree)
+        nothing = jnp.zeros((tree.num_nodes, self.features))
+        bias = self.own(nothing[0])
+
+        def visit(module: TaskEmbedding, incoming: jax.Array, node: jax.Array) -> tuple[jax.Array, Any]:
+            here = nn.tanh(bias + incoming[node])
+            sent = nn.tanh(module.message(here) + edge[node]) * sends[node]
+            return incoming.at[tree.parent[node]].add(sent), (here, sent)
+
+        return sweep_up(visit, self, nothing)
+
+    def of_way(self, ahead: jax.Array) -> jax.Array:
+        """Embeds a sequence of sub-tasks as the sweep would, ``[F]``; p₊ is ``[D, P]``, empty rows after its end."""
+        bias = self.own(jnp.zeros(self.features))
+        x = nn.tanh(bias)
+        for reach in ahead[::-1]:
+            x = nn.tanh(bias + reach.any() * nn.tanh(self.message(x) + self.edge(reach)))
+        return x

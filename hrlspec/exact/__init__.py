@@ -1,0 +1,1 @@
+"""Exact answers: product automata, dynamic programming, and agents that know the map."""

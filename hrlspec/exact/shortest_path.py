@@ -1,0 +1,282 @@
+"""A planner that knows the map, for worlds whose steps lead anywhere in a small square: least steps, and the way.
+
+It measures agents in continuous worlds as :mod:`hrlspec.exact.solver` does in finite ones. An environment offers
+``grid(layout)``: the places that whole steps lead to, from each to its eight neighbours or nowhere. On such a grid
+a way takes max(|Δx|, |Δy|) steps, as in the world itself, so every way found is one the environment allows, and what
+is lost is less than a step for each sub-task: goals are entered at a place of the grid.
+
+Axes: **L** layouts, **X**, **Y** places, **P** atomic propositions, **K** label sets, **M** automaton states.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from hrlspec.exact.automaton import Automaton, automaton
+from hrlspec.spec.tree import TaskTree, subtask_avoid
+
+
+@dataclasses.dataclass(frozen=True)
+class Grid:
+    """Places in the plane, one grid for each layout; a step leads to one of the eight neighbours or nowhere.
+
+    Attributes:
+        symbols: bool ``[K, P]``, the label sets that occur, each once.
+        symbol: int ``[L, X, Y]``, the label set of each place, a row of ``symbols``.
+        inside: bool ``[L, X, Y]``, the places that may be entered.
+        start: int ``[L, 2]``, where episodes begin (labels of the start count only when it is entered again).
+    """
+
+    symbols: np.ndarray  # bool [K, P]
+    symbol: np.ndarray  # int [L, X, Y]
+    inside: np.ndarray  # bool [L, X, Y]
+    start: np.ndarray  # int [L, 2]
+
+    @property
+    def num_layouts(self) -> int:
+        """L."""
+        return len(self.start)
+
+    def __getitem__(self, rows: slice | np.ndarray) -> Grid:
+        """Some of the layouts."""
+        return Grid(self.symbols, self.symbol[rows], self.inside[rows], self.start[rows])
+
+
+@dataclasses.dataclass(frozen=True)
+class Way:
+    """How to satisfy a task in one layout.
+
+    Attributes:
+        places: int ``[t + 1, 2]``, the start and where each of t steps leads.
+        edges: int ``[t]``, the edge of the task that each step takes, ``TaskTree.NO_NODE`` for none.
+    """
+
+    places: np.ndarray  # int [t + 1, 2]
+    edges: np.ndarray  # int [t]
+
+    @property
+    def steps(self) -> int:
+        """The number of steps, t."""
+        return len(self.edges)
+
+
+def has_grid(env: Any) -> bool:
+    """Whether an environment tells where its steps lead, so that ways in it can be planned."""
+    return hasattr(env, "grid")
+
+
+def grid_of(env: Any, layouts: Any) -> Grid:
+    """The grids of layouts.
+
+    Args:
+        env: an environment with ``grid``.
+        layouts: a layout pytree with a leading axis L.
+    """
+    number = len(jax.tree.leaves(layouts)[0])
+    found = [env.grid(jax.tree.map(lambda x, i=i: np.asarray(x[i]), layouts)) for i in range(number)]
+    labels, inside, start = (np.stack(part) for part in zip(*found, strict=True))
+    flat = labels.reshape(-1, labels.shape[-1])
+    _, first, symbol = np.unique(flat @ (1 << np.arange(flat.shape[1])), return_index=True, return_inverse=True)
+    return Grid(flat[first], symbol.reshape(labels.shape[:-1]), inside, start)
+
+
+def planned_steps(env: Any, layouts: Any, tree: TaskTree) -> tuple[np.ndarray, np.ndarray]:
+    """What :func:`shortest_steps` and :func:`nearest_first_steps` give for a task; layouts that are alike cost once.
+
+    Args:
+        env: an environment with ``grid``.
+        layouts: a layout pytree with a leading axis L.
+        tree: one task (unbatched).
+
+    Returns:
+        Two float32 ``[L]``.
+    """
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(layouts)]
+    first: dict[bytes, int] = {}
+    alike = [first.setdefault(b"".join(leaf[i].tobytes() for leaf in leaves), i) for i in range(len(leaves[0]))]
+    kept, which = np.unique(alike, return_inverse=True)
+    grid = grid_of(env, jax.tree.map(lambda x: np.asarray(x)[kept], layouts))
+    return shortest_steps(grid, tree)[which], nearest_first_steps(grid, tree)[which]
+
+
+def shortest_steps(grid: Grid, tree: TaskTree) -> np.ndarray:
+    """The least number of steps that satisfies a task in the committed reading, inf where nothing does.
+
+    Where several edges are met at once the agent may have assigned any of them, so the best counts.
+
+    Args:
+        grid: L layouts.
+        tree: one task (unbatched).
+
+    Returns:
+        float32 ``[L]``.
+    """
+    machine = automaton(tree, grid.symbols)
+    first = machine.initial[0]
+    steps = _steps_tables(grid, machine)[first]
+    return steps[(np.arange(grid.num_layouts), *grid.start.T)]
+
+
+def shortest_way(grid: Grid, tree: TaskTree, layout: int = 0) -> Way:
+    """A way of :func:`shortest_steps`; of several, the one through the neighbours of lowest index.
+
+    Args:
+        grid: L layouts.
+        tree: one task (unbatched).
+        layout: which of the layouts.
+
+    Raises:
+        ValueError: if nothing satisfies the task there.
+    """
+    one, machine = grid[layout : layout + 1], automaton(tree, grid.symbols)
+    tables = {state: table[0] for state, table in _steps_tables(one, machine).items()}
+    place, state = (int(one.start[0, 0]), int(one.start[0, 1])), int(machine.initial[0])
+    if not np.isfinite(tables[state][place]):
+        raise ValueError("nothing satisfies the task in this layout")
+    places, edges = [place], []
+    while state != Automaton.SATISFIED:
+        options = []
+        for there in _neighbours(one, place):
+            symbol = one.symbol[0][there]
+            for choice in range(machine.successor.shape[-1]):
+                after = int(machine.successor[symbol, state, choice])
+                if after != Automaton.VIOLATED:
+                    edge = int(machine.edge[symbol, state, choice])
+                    ahead = 0.0 if after == Automaton.SATISFIED else float(tables[after][there])
+                    options.append((ahead, there, after, edge))
+        _, place, state, edge = min(options, key=lambda option: option[0])
+        places.append(place)
+        edges.append(edge)
+    return Way(np.array(places), np.array(edges))
+
+
+def nearest_first_steps(grid: Grid, tree: TaskTree) -> np.ndarray:
+    """Steps of an agent that always goes to the nearest goal among the open sub-tasks, by a shortest way.
+
+    Ways keep clear of what the sub-task avoids (eq. 2). Ties go to the sub-task of the lowest node, then to the
+    neighbour of the lowest index. An agent without a goal in reach has failed.
+
+    Args:
+        grid: L layouts.
+        tree: one task (unbatched).
+
+    Returns:
+        float32 ``[L]``, inf where the task is not satisfied.
+    """
+    machine = automaton(tree, grid.symbols)
+    return np.array([_nearest_first(grid[i : i + 1], tree, machine) for i in range(grid.num_layouts)], np.float32)
+
+
+def _nearest_first(one: Grid, tree: TaskTree, machine: Automaton) -> float:
+    """:func:`nearest_first_steps` in a single layout."""
+    reach, avoid = np.asarray(tree.reach), np.asarray(subtask_avoid(tree))
+    distances: dict[int, np.ndarray] = {}
+
+    def distance(node: int) -> np.ndarray:
+        """Further steps to a sub-task's goal after entering a place, float32 ``[X, Y]``: 0 at goals."""
+        if node not in distances:
+            harmed = (avoid[node] & one.symbols).any(-1)
+            goal = (~reach[node] | one.symbols).all(-1) & ~harmed
+            ends = np.where(goal[one.symbol], np.float32(0), np.float32(np.inf))
+            closed = (goal | harmed)[one.symbol] | ~one.inside
+            onward = _spread(np.where(one.inside, ends, np.inf), closed)
+            distances[node] = np.where(closed, ends, onward)[0]
+        return distances[node]
+
+    place, state, steps = (int(one.start[0, 0]), int(one.start[0, 1])), int(machine.initial[0]), 0
+    while state != Automaton.SATISFIED:
+        # Each turn is one step nearer to a goal, and there are finitely many goals on the way down the tree.
+        nodes = np.flatnonzero(machine.open_edges[state]).tolist()
+        around = list(_neighbours(one, place))
+        ahead = np.array([[distance(node)[there] for there in around] for node in nodes]).reshape(len(nodes), -1)
+        if not np.isfinite(ahead).any():
+            return np.inf
+        pursued, move = np.unravel_index(ahead.argmin(), ahead.shape)
+        place, steps = around[move], steps + 1
+        symbol = one.symbol[0][place]
+        choice = (machine.edge[symbol, state] == nodes[pursued]).argmax()
+        state = int(machine.successor[symbol, state, choice])
+    return float(steps)
+
+
+def _steps_tables(grid: Grid, machine: Automaton) -> dict[int, np.ndarray]:
+    """Least further steps to satisfaction from each place, float32 ``[L, X, Y]``, for each running automaton state.
+
+    The automaton never comes back to a state that it left, so states are solved from the last to the first: what
+    leaving a state is worth is known, and within it nothing but distance counts.
+    """
+    tables: dict[int, np.ndarray] = {}
+    shape = grid.symbol.shape
+    ends = {
+        Automaton.SATISFIED: np.zeros(shape, np.float32),
+        Automaton.VIOLATED: np.full(shape, np.inf, np.float32),
+    }
+    for state in _last_first(machine):
+        leaving = np.full(shape, np.inf, np.float32)
+        left = ~grid.inside
+        for symbol, successors in enumerate(machine.successor[:, state]):
+            if (successors == state).all():
+                continue
+            here = (grid.symbol == symbol) & grid.inside
+            left = left | here
+            for after in np.unique(successors):
+                following = ends[after] if after in ends else tables[int(after)]
+                leaving[here] = np.minimum(leaving[here], following[here])
+        tables[state] = _spread(leaving, left)
+    return tables
+
+
+def _last_first(machine: Automaton) -> Iterator[int]:
+    """The running states that the initial one leads to, each after all that it leads to."""
+    seen: set[int] = {Automaton.SATISFIED, Automaton.VIOLATED}
+
+    def visit(state: int) -> Iterator[int]:
+        seen.add(state)
+        for after in np.unique(machine.successor[:, state]).tolist():
+            if after not in seen:
+                yield from visit(after)
+        yield state
+
+    yield from visit(int(machine.initial[0]))
+
+
+def _spread(ends: np.ndarray, closed: np.ndarray) -> np.ndarray:
+    """Steps from each place to the best end, float32 ``[L, X, Y]``: at least 1, inf where there is no way.
+
+    Args:
+        ends: float32 ``[L, X, Y]``, further steps counted on entering an end; used where ``closed``.
+        closed: bool ``[L, X, Y]``, places at which a way ends, at the cost above; inf forbids them.
+    """
+    # A rim keeps rows apart, so that neighbours are the same array shifted, and closed places by bounds that are equal.
+    rim = ((0, 0), (1, 1), (1, 1))
+    least = np.pad(np.where(closed, ends, -np.inf), rim, constant_values=np.inf)
+    row = least.shape[-1]
+    shape, least = least.shape, least.reshape(-1)
+    most = np.pad(np.where(closed, ends, np.inf), rim, constant_values=np.inf).reshape(-1)
+    entered, across, steps = most.copy(), np.full_like(most, np.inf), np.full_like(most, np.inf)
+    while True:
+        before = steps.copy()
+        for _ in range(8):  # The test for a fixed point costs as much as a round or two.
+            np.minimum(entered[:-2], entered[2:], out=across[1:-1])
+            np.minimum(across, entered, out=across)
+            np.minimum(across[: -2 * row], across[2 * row :], out=steps[row:-row])
+            np.minimum(steps[row:-row], across[row:-row], out=steps[row:-row])
+            steps += 1
+            np.maximum(steps, least, out=entered)
+            np.minimum(entered, most, out=entered)
+        if np.array_equal(before, steps):
+            return steps.reshape(shape)[:, 1:-1, 1:-1]
+
+
+def _neighbours(one: Grid, place: tuple[int, int]) -> Iterator[tuple[int, int]]:
+    """Where one step leads, the place itself included."""
+    width, height = one.inside.shape[1:]
+    for x in range(max(place[0] - 1, 0), min(place[0] + 2, width)):
+        for y in range(max(place[1] - 1, 0), min(place[1] + 2, height)):
+            if one.inside[0, x, y]:
+                yield x, y

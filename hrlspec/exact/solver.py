@@ -1,0 +1,224 @@
+"""Exact optima of tasks on finite labelled graphs: what evaluation measures agents against, and tests the library.
+
+Dynamic programming over graph state × automaton state (and time left for returns). A graph is what
+``env.transition_table`` gives; no environment is imported here. Numpy, vectorised over layouts.
+
+Axes: **L** layouts, **S** graph states, **A** actions, **P** atomic propositions, **M** automaton states,
+**C** children of the root.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from hrlspec.exact.automaton import Automaton, automaton
+from hrlspec.spec.tree import TaskTree
+from hrlspec.tasks.rewards import RewardMachine
+
+MOST_VALUES = 4_000_000
+"""Layouts are solved in groups, so that a table of values holds no more than about this many."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Graph:
+    """Deterministic labelled graphs, one for each layout.
+
+    Attributes:
+        successors: int ``[L, S, A]``, the state each action leads to.
+        labels: bool ``[L, S, P]``, the propositions that hold in a state.
+        start: int ``[L]``, where episodes begin (labels of the start count only when it is entered again).
+    """
+
+    successors: np.ndarray  # int [L, S, A]
+    labels: np.ndarray  # bool [L, S, P]
+    start: np.ndarray  # int [L]
+
+    @property
+    def num_layouts(self) -> int:
+        """L."""
+        return self.labels.shape[0]
+
+    def __getitem__(self, index: Any) -> Graph:
+        """Some of the layouts, by anything that indexes an axis and keeps it."""
+        return Graph(self.successors[index], self.labels[index], self.start[index])
+
+
+def tabulate(env: Any, layouts: Any, params: Any = None) -> Graph:
+    """The graphs of an environment's layouts.
+
+    Args:
+        env: an environment with ``transition_table``.
+        layouts: a layout pytree with a leading axis L.
+        params: its parameters, the default ones if not given.
+    """
+    params = env.default_params if params is None else params
+    tables = jax.vmap(env.transition_table, (0, None))(layouts, params)
+    successors, labels, start = (np.asarray(table) for table in tables)
+    return Graph(successors.astype(np.int64), labels.astype(bool), start.astype(np.int64))
+
+
+def optimal_steps(graph: Graph, tree: TaskTree) -> np.ndarray:
+    """The least number of steps that satisfies a task in the committed reading, inf where nothing does.
+
+    Where several edges are met at once the agent may have assigned any of them, so the best counts.
+
+    Args:
+        graph: L layouts.
+        tree: one task (unbatched).
+
+    Returns:
+        float32 ``[L]``.
+    """
+    return _from_start(graph, tree, None, steps_table)[:, 0]
+
+
+def branch_steps(graph: Graph, tree: TaskTree) -> np.ndarray:
+    """:func:`optimal_steps` when the first edge must be that to each of the root's children, float32 ``[L, C]``."""
+    return _from_start(graph, tree, None, steps_table)[:, 1:]
+
+
+def optimal_return(graph: Graph, tree: TaskTree, rewards: RewardMachine | None, horizon: int) -> np.ndarray:
+    """The largest undiscounted return within a horizon; episodes end on satisfaction, violation or the horizon.
+
+    Args:
+        graph: L layouts.
+        tree: one task (unbatched).
+        rewards: what is paid; 1 for completing the task if ``None``.
+        horizon: steps in an episode.
+
+    Returns:
+        float32 ``[L]``.
+    """
+    return _from_start(graph, tree, rewards, lambda one: returns_table(one, horizon))[:, 0]
+
+
+def branch_returns(graph: Graph, tree: TaskTree, rewards: RewardMachine | None, horizon: int) -> np.ndarray:
+    """:func:`optimal_return` when no first edge but that to each of the root's children may be taken.
+
+    Returns:
+        float32 ``[L, C]``, 0 where the branch cannot be entered within the horizon.
+    """
+    return _from_start(graph, tree, rewards, lambda one: returns_table(one, horizon))[:, 1:]
+
+
+def root_children(tree: TaskTree) -> np.ndarray:
+    """The nodes that the columns of branch results stand for, int ``[C]``."""
+    return np.flatnonzero(np.asarray(tree.valid) & (np.asarray(tree.parent) == TaskTree.ROOT))
+
+
+def steps_table(product: Product) -> np.ndarray:
+    """Least steps to satisfaction from everywhere, float32 ``[L, S, M]``, inf where there is no way.
+
+    Values of exactly k steps appear in round k and never change, so a round that adds none is the last.
+    """
+    machine = product.automaton
+    steps = np.full((product.num_rows, machine.num_states), np.inf, np.float32)
+    steps[:, Automaton.SATISFIED] = 0
+    known = 0
+    while known < (now_known := int(np.isfinite(steps).sum())):
+        known = now_known
+        entered = product.enter(steps, np.minimum)
+        steps = product.act(entered, np.minimum)
+        steps += 1
+        steps[:, Automaton.SATISFIED] = 0
+    return steps.reshape(*product.shape, machine.num_states)
+
+
+def returns_table(product: Product, horizon: int) -> np.ndarray:
+    """Largest return with ``horizon`` steps left, from everywhere, float32 ``[L, S, M]``."""
+    values = np.zeros((product.num_rows, product.automaton.num_states), np.float32)
+    for _ in range(horizon):
+        following = product.act(product.enter(values, np.maximum, rewarded=True), np.maximum)
+        if np.array_equal(following, values):
+            break  # Nothing more to gain however much time is left.
+        values = following
+    return values.reshape(*product.shape, product.automaton.num_states)
+
+
+class Product:
+    """Graphs beside a task's automaton: rows are (layout, graph state), columns automaton states.
+
+    Attributes:
+        automaton: the task's.
+        symbol: int ``[L, S]``, the label set of each graph state, a row of ``automaton.symbols``.
+        shape: (L, S).
+    """
+
+    def __init__(self, graph: Graph, machine: Automaton, symbol: np.ndarray) -> None:
+        """Lays out the tables; :func:`product` finds ``machine`` and ``symbol``."""
+        num_layouts, num_states = symbol.shape
+        self.automaton, self.symbol, self.shape = machine, symbol, (num_layouts, num_states)
+        first_row = num_states * np.arange(num_layouts)
+        self._next_row = (graph.successors + first_row[:, None, None]).reshape(-1, graph.successors.shape[-1])
+        # Most states bear no label, and then nothing happens to the task: only the others are looked up.
+        at_rest = machine.successor == np.arange(machine.num_states)[:, None]
+        inert = at_rest.all((1, 2)) & (machine.reward == 0).all((1, 2))
+        flat = symbol.reshape(-1)
+        self._rows = np.flatnonzero(~inert[flat])
+        successor = machine.successor[flat[self._rows]].astype(np.int64)
+        self._choices = successor + (self._rows * machine.num_states)[:, None, None]
+        self._rewards = machine.reward[flat[self._rows]]
+
+    @property
+    def num_rows(self) -> int:
+        """L · S."""
+        return self.shape[0] * self.shape[1]
+
+    def enter(self, values: np.ndarray, best: np.ufunc, *, rewarded: bool = False) -> np.ndarray:
+        """The value of entering each row: its labels move the automaton, then ``values`` ``[L·S, M]`` counts."""
+        entered = values.copy()
+        outcomes = values.reshape(-1)[self._choices]
+        if rewarded:
+            outcomes = outcomes + self._rewards
+        entered[self._rows] = best.reduce(outcomes, axis=-1)
+        return entered
+
+    def act(self, entered: np.ndarray, best: np.ufunc) -> np.ndarray:
+        """The value of the best action in each row, ``[L·S, M]``."""
+        result = entered[self._next_row[:, 0]]
+        for action in range(1, self._next_row.shape[1]):
+            best(result, entered[self._next_row[:, action]], out=result)
+        return result
+
+
+def product(graph: Graph, tree: TaskTree, rewards: RewardMachine | None = None) -> Product:
+    """All layouts beside the task's automaton.
+
+    Raises:
+        ValueError: if graphs, tree and rewards do not speak of the same number of propositions.
+    """
+    return Product(graph, *_machine(graph, tree, rewards))
+
+
+def _from_start(
+    graph: Graph, tree: TaskTree, rewards: RewardMachine | None, solve: Callable[[Product], np.ndarray]
+) -> np.ndarray:
+    """A table's values at the start for each of the automaton's initial states, float32 ``[L, 1 + C]``."""
+    machine, symbol = _machine(graph, tree, rewards)
+    size = max(1, MOST_VALUES // (symbol.shape[1] * machine.num_states))
+    values = np.empty((graph.num_layouts, len(machine.initial)), np.float32)
+    for first in range(0, graph.num_layouts, size):
+        group = slice(first, first + size)
+        part = graph[group]
+        table = solve(Product(part, machine, symbol[group]))
+        values[group] = table[np.arange(part.num_layouts)[:, None], part.start[:, None], machine.initial]
+    return values
+
+
+def _machine(graph: Graph, tree: TaskTree, rewards: RewardMachine | None) -> tuple[Automaton, np.ndarray]:
+    """The task's automaton over the label sets that occur, and which of them each state bears, int ``[L, S]``."""
+    symbols, symbol = _distinct(graph.labels.reshape(-1, graph.labels.shape[-1]))
+    return automaton(tree, symbols, rewards), symbol.reshape(graph.labels.shape[:2])
+
+
+def _distinct(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The distinct rows, bool ``[K, P]``, and which of them each row is, int ``[rows]``."""
+    packed = np.packbits(labels, axis=-1)
+    words = np.ascontiguousarray(packed).view(np.dtype((np.void, packed.shape[-1])))[:, 0]
+    _, first, which = np.unique(words, return_index=True, return_inverse=True)
+    return labels[first], which.reshape(-1)

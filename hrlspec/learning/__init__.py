@@ -1,0 +1,1 @@
+"""Learning: collection, relabelling, targets, losses, and one training iteration."""

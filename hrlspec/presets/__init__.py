@@ -1,0 +1,1 @@
+"""Presets: everything that a world needs to be trained, evaluated and drawn."""

@@ -1,0 +1,1 @@
+"""The host's side of a run: flags, folder, loop, progress, tables, pictures."""

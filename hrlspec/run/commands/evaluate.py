@@ -1,0 +1,176 @@
+"""Evaluates a trained agent: ``python -m experiments.evaluate --run DIR``, with ``--help`` for the flags.
+
+Exit status: 0 done, 2 bad usage or input.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from hrlspec import checkpoint
+from hrlspec.agent.agent import Agent, Params
+from hrlspec.evaluation import Suite, evaluate_suite, suite_from_text
+from hrlspec.evaluation.suite import MAX_NODES
+from hrlspec.presets.settings import rewards_of
+from hrlspec.presets.suites import load_suite
+from hrlspec.run import platform
+from hrlspec.run.errors import UserError
+from hrlspec.run.experiment import Experiment, environment_of, experiment_of
+from hrlspec.run.flags import parse_flags
+from hrlspec.run.folder import read_record
+from hrlspec.run.tables import result_console, suite_table
+
+PROGRAM = "python -m experiments.evaluate"
+MOST_PICTURES = 9
+_LARGEST_FILE = 1_000_000  # bytes
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateFlags:
+    """Reports success, return, steps and SPL of a trained agent on the given tasks, in layouts drawn at random.
+
+    Exactly one of --spec, --spec-file and --suite says which tasks.
+    """
+
+    run: Path
+    """The run folder."""
+    spec: str | None = None
+    """A task in SPECTRL, such as "achieve a; (achieve b ensuring not c)"."""
+    spec_file: Path | None = None
+    """A file with one task a line; # begins a comment."""
+    suite: str | None = None
+    """A test suite of the run's environment, such as dag."""
+    episodes: int = 500
+    """In all; at least one for each task."""
+    seed: int = 0
+    """Of layouts and actions."""
+    step: int | None = None
+    """The checkpoint to load; the newest if not given."""
+    greedy: bool = False
+    """Take the most likely action and sub-task instead of sampling."""
+    shield: bool = False
+    """Replace actions that would step on forbidden propositions."""
+    max_nodes: int = MAX_NODES
+    """Largest task tree."""
+    draw: Path | None = None
+    """A picture (.png or .svg) of one episode of each task, of the first nine."""
+    json: bool = False
+    """Print one JSON object and nothing else on standard output."""
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command line.
+
+    Args:
+        argv: the arguments, those of the process by default.
+
+    Raises:
+        UserError: bad usage or input.
+        SpecError: a task cannot be read.
+        CheckpointError: there is no usable checkpoint.
+    """
+    flags = parse_flags(EvaluateFlags, sys.argv[1:] if argv is None else argv, program=PROGRAM)
+    _check(flags)
+    experiment = experiment_of(read_record(flags.run)["config"], str(flags.run))
+    suite = tasks_of(flags, experiment)
+    platform.prepare(experiment.env, experiment.recipe)
+    agent = Agent(environment_of(experiment), experiment.config)
+    params, step = load_params(agent, flags.run, flags.step)
+    try:
+        result = evaluate_suite(
+            jax.random.fold_in(jax.random.key(flags.seed), 1),
+            agent,
+            params,
+            rewards_of(experiment.env, experiment.reward_set),
+            suite,
+            layouts_per_task=-(-flags.episodes // len(suite)),
+            seed=flags.seed,
+            greedy=flags.greedy,
+            shield=flags.shield,
+        )
+    except ValueError as error:
+        raise UserError(str(error)) from error  # a task that nothing can satisfy
+    if flags.draw is not None:
+        _draw(flags, agent, params, experiment, suite)
+    if flags.json:
+        facts: dict[str, Any] = {"run": str(flags.run), "checkpoint_step": step, "reward_set": experiment.reward_set}
+        print(json.dumps({**facts, **result.to_json()}, allow_nan=False))
+        return
+    console = result_console()
+    console.print(suite_table(result))
+    if 1 < len(suite) <= 20:
+        for task in result.per_task:
+            score = task.score
+            line = f"{score.success_rate.estimate:.3f}  {task.task}"
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _draw(flags: EvaluateFlags, agent: Agent, params: Params, experiment: Experiment, suite: Suite) -> None:
+    from hrlspec.run import plots
+
+    assert flags.draw is not None
+    some = suite.take(np.arange(min(len(suite), MOST_PICTURES)))
+    machine = rewards_of(experiment.env, experiment.reward_set)
+    episodes = plots.episodes_of(jax.random.key(flags.seed), agent, params, machine, some)
+    flags.draw.parent.mkdir(parents=True, exist_ok=True)
+    plots.gallery(episodes, agent.env.propositions, flags.draw)
+
+
+def load_params(agent: Agent, run: Path, step: int | None = None) -> tuple[Params, int]:
+    """The parameters in a run's newest intact checkpoint, or in that of ``step``, and its step.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    target = {"params": jax.eval_shape(agent.init, jax.random.key(0))}
+    restored = checkpoint.load(run / "checkpoints", target, step=step, partial=True)
+    return restored.state["params"], restored.step
+
+
+def tasks_of(flags: EvaluateFlags, experiment: Experiment) -> Suite:
+    """The tasks that the flags name.
+
+    Raises:
+        UserError: no such suite or file.
+        SpecError: a task cannot be read or is too large.
+    """
+    if flags.suite is not None:
+        return load_suite(experiment.env, flags.suite)
+    if flags.spec is not None:
+        # A task may be written over several lines; a suite has one on each.
+        name, text = "--spec", " ".join(line.split("#", 1)[0] for line in flags.spec.splitlines())
+    else:
+        assert flags.spec_file is not None
+        name, text = flags.spec_file.name, _read(flags.spec_file)
+    return suite_from_text(name, text, environment_of(experiment).propositions, max_nodes=flags.max_nodes)
+
+
+def _read(file: Path) -> str:
+    try:
+        if file.stat().st_size > _LARGEST_FILE:
+            raise UserError(f"{file} is larger than {_LARGEST_FILE} bytes; a file of tasks has one formula a line")
+        return file.read_text(encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"cannot read {file}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"cannot read {file}: not UTF-8 text") from error
+
+
+def _check(flags: EvaluateFlags) -> None:
+    given = [name for name in ("spec", "spec_file", "suite") if getattr(flags, name) is not None]
+    if len(given) != 1:
+        found = " and ".join(f"--{name.replace('_', '-')}" for name in given) or "none"
+        raise UserError(f"expected exactly one of --spec, --spec-file and --suite, found {found}")
+    if flags.draw is not None and flags.draw.suffix not in (".png", ".svg"):
+        raise UserError(f"--draw {flags.draw}: expected a file that ends in .png or .svg")
+    for name, low, high in (("episodes", 1, 1_000_000), ("seed", 0, 2**31 - 1), ("max_nodes", 2, 4096)):
+        if not low <= getattr(flags, name) <= high:
+            raise UserError(f"--{name.replace('_', '-')} is {getattr(flags, name)}, expected {low} to {high}")

@@ -1,0 +1,368 @@
+"""The folder of one run: written by one process, resumable, readable by any tool.
+
+::
+
+    config.json      everything resolved, versions, commit, command
+    metrics.jsonl    one JSON object for each evaluation, in the order of env_steps
+    checkpoints/     see hrlspec.checkpoint.store
+    tensorboard/     event files with the same numbers as metrics.jsonl
+    plots/           pictures
+    summary.json     the final results
+
+A row of metrics is written before the checkpoint of its step. So after a kill at any moment the rows up to the newest
+checkpoint are complete, and those after it, which the resumed run writes again, are dropped: no row appears twice.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import datetime
+import hashlib
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any
+
+import jax
+import numpy as np
+
+from hrlspec.run.errors import UserError
+from hrlspec.version import __version__
+
+FORMAT = 1
+_LOCK = ".lock"
+_LEFT_BY_A_KILL = {_LOCK, ".config.json.new"}  # all that a process killed at once after its start leaves
+_PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "orbax-checkpoint")
+
+
+@dataclasses.dataclass
+class RunFolder:
+    """An open run folder, from `open_run`; this process alone writes to it.
+
+    Attributes:
+        path: the folder.
+        config: the resolved configuration as in ``config.json``.
+        config_hash: its SHA-256, to be kept with each checkpoint.
+        resumed: whether the folder held this run before.
+    """
+
+    path: Path
+    config: dict[str, Any]
+    config_hash: str
+    resumed: bool
+    _tensorboard: bool
+    _last_step: int | None = None  # of metrics.jsonl; None until a resumed run says where it resumes
+    _events: Any = None
+
+    @property
+    def checkpoints(self) -> Path:
+        """Where the checkpoints go."""
+        return self.path / "checkpoints"
+
+    @property
+    def plots(self) -> Path:
+        """Where the pictures go; made on first use."""
+        folder = self.path / "plots"
+        folder.mkdir(exist_ok=True)
+        return folder
+
+    def rewind(self, env_steps: int) -> int:
+        """Drops the rows after ``env_steps``. A resumed run says so first, before it adds rows.
+
+        Args:
+            env_steps: the step of the checkpoint it resumes from; -1 when there is none and it begins anew.
+
+        Returns:
+            How many rows were dropped, a half-written last line included.
+        """
+        rows, dropped = _read_rows(self.path)
+        kept = [row for row in rows if row["env_steps"] <= env_steps]
+        dropped += len(rows) - len(kept)
+        if dropped:
+            _write_atomically(self.path / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in kept))
+        self._begin(env_steps)
+        return dropped
+
+    def append(self, row: Mapping[str, Any]) -> None:
+        """Adds one evaluation to ``metrics.jsonl``, on the disk when this returns, and its numbers to TensorBoard.
+
+        Args:
+            row: ``env_steps`` and any JSON-like values; numpy and JAX scalars and arrays become numbers and lists, and
+                numbers that are not finite become ``null``, which every JSON reader understands.
+        """
+        plain = _plain(row)
+        if not isinstance(plain.get("env_steps"), int):
+            raise ValueError(f"a row of metrics needs an integer env_steps, found {plain.get('env_steps')!r}")
+        if self._last_step is None:
+            raise RuntimeError("a resumed run calls rewind before it adds rows")
+        if plain["env_steps"] < self._last_step:
+            raise ValueError(f"row of env_steps {plain['env_steps']} after one of {self._last_step}")
+        self._last_step = plain["env_steps"]
+        with (self.path / "metrics.jsonl").open("a") as file:
+            file.write(json.dumps(plain, allow_nan=False) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+        if self._events is not None:
+            for name, value in plain.items():
+                if isinstance(value, int | float) and name != "env_steps":
+                    self._events.add_scalar(name, value, plain["env_steps"])
+            self._events.flush()
+
+    def write_summary(self, summary: Mapping[str, Any]) -> None:
+        """Writes ``summary.json``, replacing an earlier one as a whole."""
+        _write_atomically(self.path / "summary.json", json.dumps(_plain(summary), indent=2, allow_nan=False) + "\n")
+
+    def _begin(self, env_steps: int) -> None:
+        """Accepts rows from ``env_steps`` on; TensorBoard is told to forget what an earlier process wrote after it."""
+        self._last_step = env_steps
+        if not self._tensorboard:
+            return
+        try:
+            from tensorboardX import SummaryWriter
+        except ImportError as error:
+            raise UserError('TensorBoard event files need the extra "cli": pip install "hrlspec[cli]"') from error
+        self._close_events()
+        folder = self.path / "tensorboard"
+        suffix = f".{len(list(folder.iterdir())) if folder.exists() else 0}"  # else two within a second share a file
+        purge_step = env_steps + 1 if self.resumed else None
+        self._events = SummaryWriter(str(folder), purge_step=purge_step, filename_suffix=suffix)
+
+    def _close_events(self) -> None:
+        if self._events is not None:
+            self._events.close()
+            self._events = None
+
+
+@contextlib.contextmanager
+def open_run(
+    path: str | os.PathLike[str],
+    config: Any,
+    *,
+    resume: bool = False,
+    may_change: Sequence[str] = (),
+    tensorboard: bool = True,
+) -> Iterator[RunFolder]:
+    """Makes a run folder, or opens that of a run to be resumed, and locks it until the context ends.
+
+    Args:
+        path: the folder; a new run needs one that is missing or empty.
+        config: everything that determines the run, as a dataclass or a mapping of JSON-like values.
+        resume: continue the run that the folder holds.
+        may_change: dotted names of the configuration in which a resumed run may differ, such as ``total_steps``.
+        tensorboard: whether rows also go to TensorBoard event files.
+
+    Raises:
+        UserError: the folder holds another run, or none to resume, or is in use, or cannot be written.
+    """
+    with contextlib.ExitStack() as stack:
+        try:
+            run = _open(stack, Path(path), config, resume, may_change, tensorboard)
+        except OSError as error:
+            raise UserError(f"cannot write to {path}: {error.strerror}") from error
+        yield run
+
+
+def _open(
+    stack: contextlib.ExitStack, folder: Path, config: Any, resume: bool, may_change: Sequence[str], tensorboard: bool
+) -> RunFolder:
+    """`open_run` up to the point where the caller takes over; what must be undone goes on the stack."""
+    resolved = _plain(config)
+    _check_place(folder, resume)
+    folder.mkdir(parents=True, exist_ok=True)
+    _lock(stack.enter_context((folder / _LOCK).open("a")), folder)
+    _check_place(folder, resume)  # again under the lock: another process may have begun a run meanwhile
+    circumstances = _circumstances()
+    record = {"format": FORMAT, "config": resolved, "config_hash": config_hash(resolved), **circumstances}
+    if resume:
+        before = read_record(folder)
+        _check_same(folder, before["config"], resolved, may_change)
+        record["earlier"] = [*before.get("earlier", []), {name: before.get(name) for name in circumstances}]
+    _write_atomically(folder / "config.json", json.dumps(record, indent=2) + "\n")
+    run = RunFolder(folder, resolved, record["config_hash"], resume, tensorboard)
+    stack.callback(run._close_events)
+    if not resume:
+        run._begin(-1)
+    return run
+
+
+def read_record(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """``config.json`` of a run: ``config``, ``config_hash``, ``versions``, ``commit``, ``command``, ``started``.
+
+    Raises:
+        UserError: this is not a run folder, or its record is damaged or of another format.
+    """
+    file = Path(path) / "config.json"
+    try:
+        record = json.loads(file.read_text())
+    except FileNotFoundError as error:
+        raise UserError(f"{path} is not a run folder: there is no {file.name} in it") from error
+    except (OSError, ValueError) as error:
+        raise UserError(f"cannot read {file}: {error}") from error
+    if not isinstance(record, dict) or record.get("format") != FORMAT or not isinstance(record.get("config"), dict):
+        raise UserError(f"{file} is not the record of a run in format {FORMAT}")
+    if record.get("config_hash") != config_hash(record["config"]):
+        raise UserError(f"{file} was changed by hand: its configuration does not match its config_hash")
+    return record
+
+
+def read_metrics(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
+    """The rows of ``metrics.jsonl``, without a last line that was cut off; empty when there is none yet.
+
+    Raises:
+        UserError: a line before the last is not a row.
+    """
+    return _read_rows(Path(path))[0]
+
+
+def read_summary(path: str | os.PathLike[str]) -> dict[str, Any] | None:
+    """``summary.json`` of a run, ``None`` while the run is not finished.
+
+    Raises:
+        UserError: it is damaged.
+    """
+    file = Path(path) / "summary.json"
+    try:
+        summary = json.loads(file.read_text())
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise UserError(f"cannot read {file}: {error}; without it --resume writes it anew") from error
+    if not isinstance(summary, dict):
+        raise UserError(f"{file} is not a summary; without it --resume writes it anew")
+    return summary
+
+
+def config_hash(config: Mapping[str, Any]) -> str:
+    """SHA-256 of a configuration, the same for every order of its entries."""
+    return hashlib.sha256(json.dumps(_plain(config), sort_keys=True).encode()).hexdigest()
+
+
+def _check_place(folder: Path, resume: bool) -> None:
+    """Refuses what can be refused before anything is made in or beside the folder."""
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"{folder} is a file; a run needs a folder")
+    holds_run = (folder / "config.json").exists()
+    if resume and not holds_run:
+        raise UserError(f"there is no run to resume in {folder}")
+    if holds_run and not resume:
+        raise UserError(f"{folder} holds a run already: continue it with --resume, or choose another --out")
+    if not holds_run and folder.is_dir() and {entry.name for entry in folder.iterdir()} - _LEFT_BY_A_KILL:
+        raise UserError(f"{folder} is not empty and holds no run; choose another --out")
+
+
+def _check_same(folder: Path, there: Any, here: Any, may_change: Sequence[str]) -> None:
+    """Refuses to continue a run under another configuration, naming the first difference."""
+    old, new = _dotted(there), _dotted(here)
+    names = [name for name in sorted(old.keys() | new.keys()) if old.get(name) != new.get(name)]
+    names = [name for name in names if name not in may_change]
+    if names:
+        first = names[0]
+        more = f" ({len(names) - 1} more differ)" if len(names) > 1 else ""
+        raise UserError(
+            f"{folder} was begun with {first} = {old.get(first, 'nothing')!r}, not {new.get(first, 'nothing')!r}"
+            f"{more}: resume with the flags it was begun with, or choose another --out"
+        )
+
+
+def _dotted(config: Any, prefix: str = "") -> dict[str, Any]:
+    """Nested entries under dotted names."""
+    if not isinstance(config, dict) or not config:
+        return {prefix: config}
+    return {
+        name: value
+        for key, inner in config.items()
+        for name, value in _dotted(inner, f"{prefix}.{key}" if prefix else key).items()
+    }
+
+
+def _lock(file: IO[str], folder: Path) -> None:
+    """Holds the folder for this process while the file is open. The system frees it however the process ends."""
+    if sys.platform == "win32":
+        return  # there are no such locks; the other checks hold
+    import fcntl
+
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise UserError(f"another process is writing to {folder}; wait for it, or choose another --out") from error
+
+
+def _read_rows(folder: Path) -> tuple[list[dict[str, Any]], int]:
+    """The complete rows, and 1 if a half-written line follows them, else 0."""
+    file = folder / "metrics.jsonl"
+    if not file.exists():
+        return [], 0
+    lines = file.read_text(errors="replace").split("\n")
+    rows = []
+    for number, line in enumerate(lines[:-1], start=1):
+        try:
+            row = json.loads(line)
+            row["env_steps"] + 0
+        except (ValueError, TypeError, KeyError) as error:
+            raise UserError(f"{file}, line {number}: not a row of metrics") from error
+        rows.append(row)
+    return rows, int(lines[-1] != "")
+
+
+def _plain(value: Any) -> Any:
+    """The value in terms of JSON."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return _plain(dataclasses.asdict(value))
+    if isinstance(value, Mapping):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return _plain(np.asarray(value).tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | int):
+        return value
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    raise TypeError(f"a {type(value).__name__} has no form in JSON: {value!r}")
+
+
+def _circumstances() -> dict[str, Any]:
+    """What a run's numbers depend on beside its configuration."""
+    versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    return {
+        "versions": {"hrlspec": __version__, "python": platform.python_version(), **versions},
+        "commit": _commit(),
+        "command": sys.argv,
+        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPUs",
+        "devices": [str(device) for device in jax.devices()],
+    }
+
+
+def _commit() -> str | None:
+    """The commit this code stands at, ``+changes`` if files differ from it; ``None`` where git does not know."""
+    source = Path(__file__)
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(source.parent), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    try:
+        git("ls-files", "--error-unmatch", source.name)  # an installed copy may lie in somebody else's repository
+        return git("rev-parse", "HEAD") + ("+changes" if git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def _write_atomically(file: Path, text: str) -> None:
+    """Replaces a file so that no reader and no kill ever meets half of it."""
+    temporary = file.with_name(f".{file.name}.new")
+    with temporary.open("w") as stream:
+        stream.write(text)
+        stream.flush()
+        os.fsync(stream.fileno())
+    temporary.replace(file)

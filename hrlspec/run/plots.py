@@ -1,0 +1,228 @@
+"""Pictures of runs: learning curves, example trajectories, task graphs, one animation.
+
+Axes: **B** episodes, **H** horizon.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw
+
+from hrlspec.agent.agent import Agent, Params
+from hrlspec.evaluation import Suite
+from hrlspec.evaluation.cases import draw_layouts
+from hrlspec.evaluation.episodes import trace_episodes
+from hrlspec.run.stages import Leg, Stage, position_of, stage_of
+from hrlspec.spec import RUNNING, SATISFIED, VIOLATED, TaskState, TaskTree, draw_task, subtasks
+from hrlspec.tasks.rewards import RewardMachine
+
+_FRAME_MS, _LAST_FRAME_MS = 350, 1500
+_MOST_FRAMES = 80
+_CURVES = {
+    "eval/success_rate": "success on unseen tasks",
+    "eval/spl": "SPL on unseen tasks",
+    "eval/return_mean": "return on unseen tasks",
+    "eval/steps_mean": "steps of successful episodes",
+    "train/success_rate": "success while training",
+    "level": "curriculum level",
+}
+
+
+def learning_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], file: Path) -> Path:
+    """Draws the rows of ``metrics.jsonl`` of one run or several, each a line, and returns the PNG's path."""
+    figure = Figure(figsize=(12, 6), layout="constrained")
+    for ax, (name, title) in zip(figure.subplots(2, 3).flat, _CURVES.items(), strict=True):
+        for label, rows in runs.items():
+            points = [(row["env_steps"], row[name]) for row in rows if row.get(name) is not None]
+            if points:
+                steps, values = zip(*points, strict=True)
+                ax.plot(np.array(steps) / 1e6, values, label=label, marker="." if len(points) < 10 else None)
+        ax.set_title(title, fontsize=10)
+        ax.set_xlabel("million environment steps", fontsize=8)
+        ax.grid(alpha=0.3)
+        if "success" in name or name == "eval/spl":
+            ax.set_ylim(-0.02, 1.02)
+    if len(runs) > 1:
+        figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
+    figure.savefig(file, dpi=110, metadata={"Software": None})
+    return file
+
+
+@dataclasses.dataclass(frozen=True)
+class Episode:
+    """One episode, for drawing.
+
+    Attributes:
+        formula: the task.
+        tree: the same, unbatched.
+        stage: where it took place.
+        positions: ``[t + 1, 2 or more]``, where the agent was, the end included.
+        nodes: int ``[t + 1]``, where the task stood.
+        assigned: int ``[t]``, the edge in force at each step.
+        success: the task was satisfied.
+        violated: the task was violated, or the environment ended the episode.
+    """
+
+    formula: str
+    tree: TaskTree
+    stage: Stage
+    positions: np.ndarray
+    nodes: np.ndarray
+    assigned: np.ndarray
+    success: bool
+    violated: bool
+
+    def legs(self, names: Sequence[str]) -> list[Leg]:
+        """The sub-tasks in the order in which they were in force."""
+        changes = [0] + [
+            t
+            for t in range(1, len(self.assigned))
+            if self.nodes[t] != self.nodes[t - 1] or self.assigned[t] != self.assigned[t - 1]
+        ]
+        legs = []
+        for number, (first, end) in enumerate(zip(changes, [*changes[1:], len(self.assigned)], strict=True), 1):
+            completed = self.nodes[end] != self.nodes[end - 1]
+            # A flat policy is assigned nothing: what it completed was its sub-task, whatever it meant to do.
+            edge = int(self.assigned[first]) or int(completed * self.nodes[end])
+            if edge == TaskTree.ROOT:
+                legs.append(Leg(first, end - 1, f"{number}. what remains", (), (), False))
+                continue
+            (found,) = [x for x in subtasks(self.tree, int(self.tree.parent[edge]), names) if x.node == edge]
+            reach, avoid = (tuple(str(name) for name in some) for some in (found.reach, found.avoid))
+            label = f"{number}. {' and '.join(reach)}" + (f", avoiding {' '.join(avoid)}" if avoid else "")
+            legs.append(Leg(first, end - 1, label, reach, avoid, bool(completed)))
+        return legs
+
+    @property
+    def outcome(self) -> str:
+        """How it ended."""
+        return "satisfied" if self.success else "violated" if self.violated else "not satisfied in time"
+
+
+def examples(
+    key: jax.Array, agent: Agent, params: Params, machine: RewardMachine, suite: Suite, folder: Path
+) -> list[Path]:
+    """Lets an agent carry out one task of each depth and draws it; only for environments that have pictures.
+
+    Args:
+        key: consumed.
+        agent: the networks.
+        params: their parameters.
+        machine: the rewards.
+        suite: unseen tasks; of those with a choice the shortest to write are taken.
+        folder: where the pictures go.
+
+    Returns:
+        ``example_<depth>.png`` and ``task_<depth>.png`` for each depth, and ``episode.gif`` of the deepest.
+    """
+    has_choice = np.asarray(suite.trees.accepting).sum(-1) > 1
+    length = np.array([len(formula) for formula in suite.formulas]) + 10_000 * ~has_choice
+    depths = np.unique(suite.depths)
+    rows = [int(np.argmin(np.where(suite.depths == depth, length, np.iinfo(int).max))) for depth in depths]
+    files: list[Path] = []
+    names = agent.env.propositions
+    shown = episodes_of(key, agent, params, machine, suite.take(rows))
+    for depth, episode in zip(depths, shown, strict=False):
+        files += [folder / f"example_{depth}.png", folder / f"task_{depth}.png"]
+        trajectory(episode, names, files[-2])
+        task_graph(episode, names, files[-1])
+    return [*files, animation(shown[-1], names, folder / "episode.gif")] if shown else []
+
+
+def episodes_of(key: jax.Array, agent: Agent, params: Params, machine: RewardMachine, suite: Suite) -> list[Episode]:
+    """One episode of each task of a suite, each in a layout of its own, actions sampled; none without pictures."""
+    layouts = draw_layouts(agent.env, suite, 1)
+    stages = [stage_of(agent.env, jax.tree.map(lambda x, i=i: x[i], layouts)) for i in range(len(suite))]
+    if None in stages:
+        return []
+    episodes, trace = trace_episodes(key, agent, params, machine, suite.trees, layouts)
+    positions = position_of(trace.env_state)
+    found = []
+    for i, (formula, stage) in enumerate(zip(suite.formulas, stages, strict=True)):
+        # Entry t is the state before step t, so the one after the last step is there unless the horizon came first.
+        end = min(int(episodes.steps[i]) + 1, len(trace.node))
+        tree: TaskTree = jax.tree.map(lambda x, i=i: x[i], suite.trees)
+        assert stage is not None
+        found.append(
+            Episode(
+                formula=formula,
+                tree=tree,
+                stage=stage,
+                positions=positions[:end, i],
+                nodes=np.asarray(trace.node)[:end, i],
+                assigned=np.asarray(trace.assigned)[: end - 1, i],
+                success=bool(episodes.success[i]),
+                violated=bool(episodes.violated[i]),
+            )
+        )
+    return found
+
+
+def trajectory(episode: Episode, names: Sequence[str], file: Path) -> Path:
+    """Draws an episode as a line, coloured by the sub-task in force; chosen instances are marked."""
+    figure = Figure(figsize=(7.5, 5.2), layout="constrained")
+    ax = figure.subplots()
+    episode.stage.draw(ax, episode.positions, episode.legs(names))
+    title = "\n".join(textwrap.wrap(episode.formula, 80))
+    ax.set_title(f"{title}\n{episode.outcome}, {len(episode.assigned)} steps", fontsize=9)
+    ax.set_axis_off()
+    figure.legend(loc="outside right center", title="sub-tasks", fontsize=9)
+    figure.savefig(file, dpi=110, metadata={"Software": None})
+    return file
+
+
+def gallery(episodes: Sequence[Episode], names: Sequence[str], file: Path) -> Path:
+    """Several episodes side by side, as `trajectory` draws each; the file's ending says in which format."""
+    columns = min(len(episodes), 3)
+    rows = -(-len(episodes) // columns)
+    figure = Figure(figsize=(5 * columns, 5.2 * rows), layout="constrained")
+    axes: Any = figure.subplots(rows, columns, squeeze=False)
+    for ax in axes.flat:
+        ax.set_axis_off()
+    for ax, episode in zip(axes.flat, episodes, strict=False):
+        episode.stage.draw(ax, episode.positions, episode.legs(names))
+        title = "\n".join(textwrap.wrap(episode.formula, 60))
+        ax.set_title(f"{title}\n{episode.outcome}, {len(episode.assigned)} steps", fontsize=9)
+        ax.legend(loc="upper right", fontsize=7)
+    with rc_context({"svg.hashsalt": file.stem}):
+        figure.savefig(file, dpi=110, metadata={"Date": None} if file.suffix == ".svg" else {"Software": None})
+    return file
+
+
+def task_graph(episode: Episode, names: Sequence[str], file: Path) -> Path:
+    """Draws the task with the branch that was taken."""
+    status = SATISFIED if episode.success else VIOLATED if episode.violated else RUNNING
+    blocked = np.zeros(episode.tree.num_nodes, bool)
+    state = TaskState(node=episode.nodes[-1], blocked=blocked, status=np.int32(status))  # type: ignore[arg-type]
+    draw_task(episode.tree, names, state).savefig(file, dpi=110, metadata={"Software": None})
+    return file
+
+
+def animation(episode: Episode, names: Sequence[str], file: Path) -> Path:
+    """The episode as a GIF, the sub-task in force below; of a long one every so many steps."""
+    legs, last = episode.legs(names), len(episode.positions) - 1
+    stride = -(-len(episode.positions) // _MOST_FRAMES)
+    times = [*range(0, last, stride), last]
+    frames = []
+    for t in times:
+        leg = next((leg for leg in legs if leg.first <= t <= leg.last), None)
+        picture = episode.stage.frame(episode.positions, t, leg)
+        caption = f"step {t}: {leg.label if leg else episode.outcome}"
+        frame = Image.new("RGB", (picture.shape[1], picture.shape[0] + 28), "white")
+        frame.paste(Image.fromarray(picture), (0, 0))
+        ImageDraw.Draw(frame).text((8, picture.shape[0] + 6), caption, fill="black", font_size=15)
+        # A palette without dithering keeps the file small and the colours flat.
+        frames.append(frame.quantize(64, dither=Image.Dither.NONE))
+    pause = _FRAME_MS if stride == 1 else _FRAME_MS // 4
+    durations = [pause] * (len(frames) - 1) + [_LAST_FRAME_MS]
+    frames[0].save(file, save_all=True, append_images=frames[1:], duration=durations, loop=0)
+    return file

@@ -1,0 +1,113 @@
+"""Results as tables for the terminal."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from hrlspec.evaluation import Aggregate, SuiteResult
+from hrlspec.evaluation.stats import Interval
+from hrlspec.run.learner import FinalResults
+
+_NAMES = {
+    "success_rate": "success",
+    "return_mean": "return",
+    "steps_mean": "steps",
+    "spl": "SPL",
+}
+
+
+def result_console() -> Console:
+    """Standard output; where it is no terminal, wide enough for any table."""
+    console = Console()
+    return console if console.is_terminal else Console(width=100)
+
+
+def suite_table(result: SuiteResult) -> Table:
+    """Success, return, steps and SPL with intervals, in all and per depth; fits into 80 columns."""
+    total, names = result.total, [name for name in _NAMES if name != "spl" or result.total.spl is not None]
+    remarks = [
+        "greedy actions" if result.greedy else "sampled actions",
+        *(["shield on"] if result.shield else []),
+        "95 % intervals",
+        "steps of successful episodes",
+        f"violated: {total.violation_rate.estimate:.3f}",
+    ]
+    if result.excluded:
+        remarks.append(f"{result.excluded} cases that nothing can satisfy in time were left out")
+    if total.optimal_steps_mean:
+        remarks.append(f"steps over optimum: {total.steps_mean.estimate / total.optimal_steps_mean:.3f}")
+    if total.myopic_spl is not None:
+        remarks.append(f"nearest goal first: success {total.myopic_success_rate:.3f}, SPL {total.myopic_spl:.3f}")
+    table = plain_table(
+        f"Unseen tasks: {result.suite} ({len(result.per_task)} tasks, {total.episodes} episodes)",
+        ["tasks", *(_NAMES[name] for name in names)],
+        "; ".join(remarks),
+    )
+    for depth, score in sorted(result.per_depth.items()):
+        table.add_row(f"depth {depth}", *(_cell(getattr(score, name)) for name in names))
+    table.add_section()
+    table.add_row("all", *(_cell(getattr(total, name)) for name in names), style="bold")
+    return table
+
+
+def final_tables(results: FinalResults) -> list[Table]:
+    """Everything a run ends with."""
+    tables = [suite_table(results.suite)]
+    if results.choice is not None:
+        choice = results.choice
+        table = plain_table(
+            f"Contested choice ({choice.episodes} layouts)",
+            ["right choices", "nearest is wrong", "nearest is right", "failures"],
+            "always the nearest instance, or always another, scores 0.5; failures count as wrong",
+        )
+        table.add_row(_cell(choice.score), _cell(choice.contested), _cell(choice.controls), f"{choice.failures:.3f}")
+        tables.append(table)
+    if results.returns is not None:
+        returns = results.returns
+        table = plain_table(
+            f"Return over optimum where the branch matters ({returns.episodes} cases)",
+            ["agent", "random branch", "longest branch"],
+        )
+        table.add_row(_cell(returns.ratio), f"{returns.random_branch:.3f}", f"{returns.longest_branch:.3f}")
+        tables.append(table)
+    return tables
+
+
+def aggregate_table(name: str, aggregates: Mapping[str, Aggregate]) -> Table:
+    """Several seeds put together."""
+    table = plain_table(
+        name,
+        ["unseen tasks", "seeds", "mean over seeds", "interquartile mean"],
+        "95 % intervals; the interquartile mean's is a bootstrap over seeds",
+    )
+    for key, title in _NAMES.items():
+        if key in aggregates:
+            value = aggregates[key]
+            table.add_row(title, str(value.runs), _cell(value.mean), _cell(value.iqm))
+    return table
+
+
+def plain_table(title: str, columns: Sequence[str], caption: str | None = None) -> Table:
+    """An empty table with a line below its head; the first column is flush left, the others right."""
+    table = Table(title=title, caption=caption, box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+    for i, column in enumerate(columns):
+        table.add_column(column, justify="right" if i else "left", no_wrap=True)
+    return table
+
+
+def _cell(interval: Interval | None) -> str:
+    """The estimate and its bounds, such as ``0.983 [.97,.99]``."""
+    if interval is None or math.isnan(interval.estimate):
+        return "-"
+    large = abs(interval.estimate) >= 10
+    estimate = f"{interval.estimate:.{1 if large else 3}f}"
+    if math.isnan(interval.low):
+        return estimate
+    low, high = (f"{bound:.1f}" if large else re.sub(r"^(-?)0\.", r"\1.", f"{bound:.2f}") for bound in interval[1:])
+    return f"{estimate} [{low},{high}]"

@@ -1,0 +1,1 @@
+"""Tasks: what they pay, and which are trained on."""

@@ -1,0 +1,98 @@
+"""The training curriculum: which tasks are collected on, and when the next level comes (paper, "Training Curriculum").
+
+Axes: **L** levels, **M** tasks per level, **E** environments.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from hrlspec.config import CurriculumConfig
+from hrlspec.spec import TaskTree
+from hrlspec.tasks.sampling import sample_sequences, sample_trees
+
+
+@struct.dataclass
+class Curriculum:
+    """Progress through the levels; carried in the training state, so a promotion never recompiles.
+
+    Attributes:
+        level: int32 ``[]``, the current level, 0-based: tasks of ``level + 1`` sub-tasks.
+        finished: int32 ``[]``, episodes of the current level finished since the last verdict.
+        succeeded: int32 ``[]``, those that satisfied their task.
+    """
+
+    level: jax.Array
+    finished: jax.Array
+    succeeded: jax.Array
+
+
+def initial() -> Curriculum:
+    """The first level, nothing counted yet."""
+    return Curriculum(level=jnp.int32(0), finished=jnp.int32(0), succeeded=jnp.int32(0))
+
+
+def update(curriculum: Curriculum, finished: jax.Array, succeeded: jax.Array, config: CurriculumConfig) -> Curriculum:
+    """Counts finished episodes of the current level; after a full window, promotes or starts a new window."""
+    finished, succeeded = curriculum.finished + finished, curriculum.succeeded + succeeded
+    verdict = finished >= config.window
+    passed = verdict & (succeeded >= config.promotion * finished)
+    return Curriculum(
+        level=jnp.minimum(curriculum.level + passed, config.levels - 1).astype(jnp.int32),
+        finished=jnp.where(verdict, 0, finished),
+        succeeded=jnp.where(verdict, 0, succeeded),
+    )
+
+
+def draw_levels(chance: jax.Array, level: jax.Array, earlier: float) -> jax.Array:
+    """Levels of the next tasks: the current one, or with probability ``earlier`` one already passed.
+
+    Args:
+        chance: float32 ``[2, S]``, uniform in [0, 1).
+        level: int32 ``[]``, the current one, 0-based.
+        earlier: a probability.
+
+    Returns:
+        int32 ``[S]``.
+    """
+    back = (chance[0] < earlier) & (level > 0)
+    return jnp.where(back, (chance[1] * level).astype(jnp.int32), level)
+
+
+def draw_bank(
+    rng: np.random.Generator, config: CurriculumConfig, num_propositions: int, reserved: np.ndarray
+) -> TaskTree:
+    """A bank of L·M training tasks, level by level; none of them has a reserved hash.
+
+    Level k holds sequences of k sub-tasks and, for a share ``tree_share``, random trees of depth k.
+    """
+    levels = []
+    num_trees = round(config.tree_share * config.tasks_per_level)
+    common: dict[str, Any] = {"num_propositions": num_propositions, "max_nodes": config.max_nodes, "reserved": reserved}
+    for level in range(1, config.levels + 1):
+        parts = []
+        if num_trees < config.tasks_per_level:
+            parts.append(
+                sample_sequences(
+                    rng, level=level, num_tasks=config.tasks_per_level - num_trees, max_avoid=config.max_avoid, **common
+                )
+            )
+        if num_trees:
+            parts.append(
+                sample_trees(
+                    rng,
+                    num_tasks=num_trees,
+                    min_depth=level,
+                    max_depth=level,
+                    max_branching=config.max_branching,
+                    max_avoid=config.max_avoid,
+                    **common,
+                )
+            )
+        levels += parts
+    return jax.tree.map(lambda *x: np.concatenate(x), *levels)

@@ -1,0 +1,115 @@
+"""Sampling, the shield, grouping, and what the agent prepares of its tasks."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hrlspec.agent.agent import Agent, in_groups, shielded_action
+from hrlspec.agent.distributions import Categorical
+from hrlspec.config import ShieldConfig
+from hrlspec.spec import TaskTree
+from tests.probes import Corridor, on_device, pairs, quick_jit, random_params, small_config
+from tests.trees import random_tree
+
+P, A = 5, 4
+
+
+@pytest.mark.parametrize("group", [1, 3, 8, 50])
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_groups_compute_for_those_in_need_and_keep_the_rest(group: int, share: float) -> None:
+    rng = np.random.default_rng(group)
+    needed = rng.random(20) < share
+    inputs = {"x": rng.normal(size=(20, 3)).astype(np.float32), "i": np.arange(20)}
+    kept = on_device((-np.ones(20, np.float32), -np.ones((20, 2), np.int32)))
+
+    def function(x: Any) -> Any:
+        assert x["x"].shape == (min(group, 20), 3)
+        return x["x"].sum(-1), jnp.stack([x["i"], 2 * x["i"]], -1)
+
+    sums, pairs_ = in_groups(function, jnp.asarray(needed), on_device(inputs), kept, group)
+    np.testing.assert_allclose(sums, np.where(needed, inputs["x"].sum(-1), -1), rtol=1e-6)
+    expected = np.stack([inputs["i"], 2 * inputs["i"]], -1)
+    np.testing.assert_array_equal(pairs_, np.where(needed[:, None], expected, -1))
+
+
+def read_shield(mode: str, threshold: float, q: np.ndarray, avoid: set[int], action: int) -> int:
+    """The paper's rule (``state``) and its milder form (``action``), in plain Python."""
+    if mode == "off" or not avoid:
+        return action
+    if mode == "state":
+        nearest = max(avoid, key=lambda g: (max(q[g]), -g))
+        return int(np.argmin(q[nearest])) if max(q[nearest]) > threshold else action
+    if max(q[g][action] for g in avoid) <= threshold:
+        return action
+    return int(np.argmin([max(q[g][a] for g in avoid) for a in range(A)]))
+
+
+@pytest.mark.parametrize("mode", ["off", "state", "action"])
+def test_shield_follows_its_rule(mode: str) -> None:
+    rng = np.random.default_rng(0)
+    replaced = 0
+
+    def act(q: jax.Array, avoid: jax.Array, action: jax.Array) -> jax.Array:
+        agent = SimpleNamespace(
+            config=SimpleNamespace(shield=ShieldConfig(mode=mode)),
+            actions=Categorical(A),
+            reach_values=lambda *_: q,
+            reach_values_of=lambda *_: q[:, action],
+        )
+        return shielded_action(agent, {}, (q, q), avoid, action)
+
+    compiled = quick_jit(jax.vmap(act))
+    q, avoid, action = rng.random((500, P, A)) ** 0.3, rng.random((500, P)) < 0.3, rng.integers(A, size=500)
+    result = compiled(q.astype(np.float32), avoid, action)
+    assert result.dtype == jnp.int32
+    for i in range(500):
+        assert int(result[i]) == read_shield(mode, 0.9, q[i], pairs(avoid[i]), int(action[i]))
+        replaced += int(result[i]) != action[i]
+    assert (replaced > 100) == (mode != "off")
+
+
+@pytest.fixture(scope="module")
+def agent() -> Agent:
+    return Agent(Corridor(), small_config())
+
+
+@pytest.fixture(scope="module")
+def trees() -> TaskTree:
+    rng = np.random.default_rng(5)
+    many = [random_tree(rng, num_nodes=6, num_propositions=4, most_together=2, distinct=True) for _ in range(20)]
+    return on_device(jax.tree.map(lambda *x: np.stack(x), *many))
+
+
+def test_the_book_holds_each_sub_tasks_avoid_set(agent: Agent, trees: TaskTree) -> None:
+    params = random_params(agent, 0)
+    book = quick_jit(agent.open_book)(params, trees)
+    instruct = quick_jit(agent.instruct)
+    for m in range(20):
+        tree = jax.tree.map(lambda x, m=m: x[m], trees)
+        alone = instruct(params, tree)
+        jax.tree.map(lambda x, y, m=m: np.testing.assert_allclose(x[m], y, atol=1e-6), book.told, alone)
+        np.testing.assert_array_equal(book.told.reach[m], tree.reach)
+        for k in range(6):
+            siblings = [j for j in range(6) if tree.valid[j] and tree.parent[j] == tree.parent[k] >= 0 and j != k]
+            reached = set().union(*(pairs(tree.reach[j]) for j in siblings))
+            expected = pairs(tree.avoid[k]) | (reached - pairs(tree.reach[k])) if tree.valid[k] else set()
+            assert pairs(book.told.avoid[m, k]) == expected
+
+
+def test_myopic_low_sees_nothing_of_the_future(trees: TaskTree) -> None:
+    agent, sighted = Agent(Corridor(), small_config(future_embedding=False)), Agent(Corridor(), small_config())
+    params = random_params(agent, 0)
+    for name, told in (
+        ("myopic", quick_jit(agent.open_book)(params, trees).told),
+        ("ours", sighted.open_book(params, trees).told),
+    ):
+        assert np.asarray(told.reach).any()
+        assert np.asarray(told.avoid).any()
+        for future in (told.future, told.ahead):
+            assert np.asarray(future).any() == (name == "ours")

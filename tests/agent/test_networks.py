@@ -1,0 +1,357 @@
+"""What the networks may and may not depend on.
+
+Parameters are random, biases too: a property that holds here holds by construction.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs_jax
+from hrlspec.agent.agent import Agent
+from hrlspec.agent.networks.controller import TURNS, Instruction, turned
+from hrlspec.agent.networks.encoder import convolve
+from hrlspec.agent.networks.planner import MASKED
+from hrlspec.config import NetworkConfig
+from hrlspec.spec import TaskState, TaskTree, initial, open_edges
+from tests.probes import (
+    Corridor,
+    on_device,
+    padded,
+    quick_jit,
+    random_order,
+    random_params,
+    reordered,
+    small_config,
+    subtree,
+)
+from tests.trees import random_tree, tree_of
+
+ENV = Corridor()
+N, WIDE = 8, 12
+ROUNDS = (0, 3)
+VIEW = ENV.view_at(2)
+
+
+@functools.cache
+def setup(rounds: int, extras: bool = False) -> tuple[Agent, Any]:
+    network = small_config().network
+    network = dataclasses.replace(
+        network, planner_rounds=rounds, task_rounds=rounds, advice=extras, child_embeddings=extras
+    )
+    agent = Agent(ENV, small_config(network=network))
+    return agent, random_params(agent, 1)
+
+
+@functools.cache
+def compiled(rounds: int) -> tuple[Any, Any]:
+    agent, params = setup(rounds)
+
+    def plan(view: Any, tree: TaskTree, state: TaskState) -> Any:
+        return agent.planner.apply(params["planner"], view, tree, state, jnp.zeros(tree.num_nodes))
+
+    return quick_jit(plan), quick_jit(functools.partial(agent.instruct, params))
+
+
+def plan(rounds: int, tree: TaskTree, *, node: int = 0, blocked: tuple[int, ...] = (), view: Any = VIEW) -> Any:
+    tree = on_device(tree)
+    state = initial(tree)
+    state = state.replace(node=jnp.int32(node), blocked=state.blocked.at[np.array(blocked, int)].set(True))
+    logits, value = compiled(rounds)[0](view, tree, state)
+    return np.asarray(logits), float(value)
+
+
+def embed(rounds: int, tree: TaskTree) -> np.ndarray:
+    return np.asarray(compiled(rounds)[1](on_device(tree)).future)
+
+
+def some_trees(number: int) -> list[TaskTree]:
+    rng = np.random.default_rng(0)
+    trees = (random_tree(rng, num_nodes=N, num_propositions=4, most_together=2, distinct=True) for _ in range(1000))
+    return [tree for tree in trees if tree.valid.sum() >= 5][:number]
+
+
+@pytest.fixture(params=ROUNDS, ids=["sweep", "3 rounds"])
+def rounds(request: pytest.FixtureRequest) -> int:
+    return request.param
+
+
+def test_only_open_edges_have_logits(rounds: int) -> None:
+    for tree in some_trees(8):
+        for node in np.flatnonzero(tree.valid & ~tree.accepting):
+            logits, value = plan(rounds, tree, node=node)
+            np.testing.assert_array_equal(logits > MASKED, tree.valid & (tree.parent == node))
+            assert np.isfinite(value)
+
+
+def test_the_order_of_children_does_not_matter(rounds: int) -> None:
+    rng = np.random.default_rng(1)
+    for tree in some_trees(8):
+        order = random_order(rng, tree)
+        moved = reordered(tree, order)
+        logits, value = plan(rounds, tree)
+        new_logits, new_value = plan(rounds, moved)
+        np.testing.assert_allclose(new_logits, logits[order], rtol=1e-4, atol=1e-5)
+        assert new_value == pytest.approx(value, rel=1e-4, abs=1e-5)
+        np.testing.assert_allclose(embed(rounds, moved), embed(rounds, tree)[order], atol=1e-5)
+
+
+def test_padding_does_not_matter(rounds: int) -> None:
+    for tree in some_trees(4):
+        logits, value = plan(rounds, tree)
+        wide_logits, wide_value = plan(rounds, padded(tree, WIDE))
+        np.testing.assert_allclose(
+            wide_logits, np.pad(logits, (0, WIDE - N), constant_values=MASKED), rtol=1e-4, atol=1e-5
+        )
+        assert wide_value == pytest.approx(value, rel=1e-4, abs=1e-5)
+        np.testing.assert_allclose(embed(rounds, padded(tree, WIDE))[:N], embed(rounds, tree), atol=1e-5)
+
+
+def test_the_planner_sees_the_subtree_alone(rounds: int) -> None:
+    """At node k it says what it says of the progression written as a tree of its own, last goal given."""
+    checked = 0
+    for tree in some_trees(10):
+        for node in np.flatnonzero(tree.valid & ~tree.accepting)[1:]:
+            logits, value = plan(rounds, tree, node=node)
+            alone, rows = subtree(tree, node, N)
+            alone.reach[0] = tree.reach[node]  # the root's one-hot is the sub-goal that was just met
+            new_logits, new_value = plan(rounds, alone)
+            np.testing.assert_allclose(new_logits[: len(rows)][1:], logits[rows][1:], rtol=1e-4, atol=1e-5)
+            assert new_value == pytest.approx(value, rel=1e-4, abs=1e-5)
+            checked += 1
+    assert checked >= 10
+
+
+def test_the_low_level_sees_what_remains_alone(rounds: int) -> None:
+    """Row k of one pass over the whole task is the embedding of the subtree at k."""
+    for tree in some_trees(6):
+        whole = compiled(rounds)[1](on_device(tree))
+        for node in np.flatnonzero(tree.valid):
+            alone = compiled(rounds)[1](on_device(subtree(tree, node, N)[0]))
+            np.testing.assert_allclose(alone.future[0], whole.future[node], atol=1e-5)
+            np.testing.assert_array_equal(alone.ahead[0], whole.ahead[node])
+
+
+def test_roles_tell_what_comes_next() -> None:
+    for tree in some_trees(6):
+        ahead = np.asarray(compiled(0)[1](on_device(tree)).ahead)
+        assert ahead.shape == (N, 2, 4)
+        for node in range(N):
+            children = [k for k in range(N) if tree.valid[k] and tree.parent[k] == node]
+            grandchildren = [k for k in range(N) if tree.valid[k] and tree.parent[k] in children]
+            for place, nodes in enumerate((children, grandchildren)):
+                np.testing.assert_array_equal(ahead[node, place], tree.reach[nodes].any(0))
+
+
+def test_the_low_level_ignores_what_later_sub_tasks_avoid(rounds: int) -> None:
+    tree = some_trees(1)[0]
+    np.testing.assert_array_equal(embed(rounds, tree), embed(rounds, tree.replace(avoid=~tree.avoid)))
+
+
+def test_a_blocked_edge_is_masked_and_silent(rounds: int) -> None:
+    """What lies behind it, and its own avoid set, change nothing; unblocked, they do."""
+    edges = [(0, "a", ""), (0, "b", ""), (1, "c", ""), (1, "d", ""), (2, "d", "")]
+    one = tree_of(edges, num_propositions=4, num_nodes=N)
+    other = tree_of(
+        [(0, "a", "d"), *edges[1:2], (1, "d", "b"), (1, "b", ""), edges[4]], num_propositions=4, num_nodes=N
+    )
+    logits, value = plan(rounds, one, blocked=(1,))
+    other_logits, other_value = plan(rounds, other, blocked=(1,))
+    assert np.flatnonzero(logits > MASKED).tolist() == [2]
+    np.testing.assert_allclose(logits, other_logits, rtol=1e-5)
+    assert value == pytest.approx(other_value, rel=1e-5)
+    assert abs(plan(rounds, one)[1] - plan(rounds, other)[1]) > 1e-4
+    assert abs(plan(rounds, one)[1] - value) > 1e-4
+
+
+def chain(goals: str) -> TaskTree:
+    return tree_of([(i, goal, "") for i, goal in enumerate(goals)], num_propositions=4, num_nodes=WIDE)
+
+
+def test_the_sweep_looks_ahead_without_limit_and_rounds_as_far_as_they_reach() -> None:
+    near, far = "abcdabcda", "abcdabcdb"  # they differ at the ninth sub-task
+    assert abs(plan(0, chain(near))[1] - plan(0, chain(far))[1]) > 0
+    assert np.abs(embed(0, chain(near))[0] - embed(0, chain(far))[0]).max() > 0
+    # With 3 rounds the message of the fourth edge does not get to the root.
+    near, far = "abca", "abcd"
+    np.testing.assert_array_equal(embed(3, chain(near))[0], embed(3, chain(far))[0])
+    assert np.abs(embed(3, chain(near))[1] - embed(3, chain(far))[1]).max() > 0
+    # The planner's nodes know their own sub-goal and their predicted latent, so only what they send ends there.
+    near, far = "abcda", "abcdb"
+    assert plan(3, chain(near))[1] == plan(3, chain(far))[1]
+    assert plan(3, chain(near), node=2)[1] != plan(3, chain(far), node=2)[1]
+
+
+def test_what_the_rounds_hand_on_does_not_grow_with_the_weights() -> None:
+    agent, params = setup(3)
+    large = jax.tree.map(lambda weights: 30 * weights, params["planner"])
+    tree = on_device(some_trees(1)[0])
+    latents = jax.random.normal(jax.random.key(0), (tree.num_nodes, agent.config.network.latent))
+    nodes = np.asarray(agent.planner.apply(large, latents, tree, initial(tree), method="embed"))
+    np.testing.assert_allclose(np.sqrt((nodes**2).mean(-1)), 1.0, atol=1e-2)
+    np.testing.assert_allclose(nodes.mean(-1), 0.0, atol=1e-5)
+
+
+def test_one_round_equals_the_sweep_where_nothing_is_below() -> None:
+    """Rounds update a node from itself again and again, the sweep once: they agree on leaves after one round."""
+    agent, params = setup(0)
+    network = dataclasses.replace(agent.config.network, task_rounds=1)
+    one = Agent(ENV, dataclasses.replace(agent.config, network=network))
+    tree = on_device(some_trees(1)[0])
+    leaves = np.asarray(tree.accepting)
+    swept, once = agent.instruct(params, tree).future, one.instruct(params, tree).future
+    np.testing.assert_allclose(np.asarray(swept)[leaves], np.asarray(once)[leaves], atol=1e-6)
+
+
+@pytest.mark.parametrize(("rounds", "extras"), [(2, False), (0, True)])
+def test_gradients_are_finite(rounds: int, extras: bool) -> None:
+    """Also where nothing is open, and through everything an agent does with a task."""
+    agent, params = setup(rounds, extras)
+    trees = jax.tree.map(lambda *x: jnp.stack(x), *map(on_device, some_trees(4)))
+    accepting = jnp.argmax(trees.accepting, -1)
+
+    def loss(params: Any) -> jax.Array:
+        book = agent.open_book(params, trees)
+        total = jnp.float32(0)
+        for node in (jnp.zeros(4, jnp.int32), accepting):
+            state = jax.vmap(initial)(trees).replace(node=node)
+
+            def one(tree: TaskTree, state: TaskState, told: Instruction) -> jax.Array:
+                logits, value = agent.plan(params, VIEW, tree, state, told)
+                scores = jax.nn.log_softmax(logits)
+                actions, own = agent.control(params, VIEW, jax.tree.map(lambda x: x[1], told))
+                open_scores = jnp.where(open_edges(tree, state), scores, 0.0).sum()
+                return open_scores + value + jax.nn.log_softmax(actions)[0] + own
+
+            total += jax.vmap(one)(trees, state, book.told).sum()
+        return total + agent.reach_values(params, VIEW).sum()
+
+    value, gradient = quick_jit(jax.value_and_grad(loss))(params)
+    assert np.isfinite(value)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
+        assert np.isfinite(leaf).all(), jax.tree_util.keystr(path)
+    assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(gradient["reach_critic"]))
+
+
+def convolution(image: np.ndarray, weights: np.ndarray, bias: np.ndarray) -> np.ndarray:
+    """A 2x2 convolution with ReLU, place by place; images are ``[C, H, W]``."""
+    channels, height, width = image.shape
+    # The weights' rows come corner by corner: (0, 0), (1, 0), (0, 1), (1, 1).
+    kernel = weights.reshape(2, 2, channels, -1)
+    result = np.zeros((weights.shape[1], height - 1, width - 1))
+    for row, column in np.ndindex(height - 1, width - 1):
+        patch = image[:, row : row + 2, column : column + 2].transpose(2, 1, 0)
+        result[:, row, column] = np.tensordot(patch, kernel, 3) + bias
+    return np.maximum(result, 0.0)
+
+
+def test_convolutions_and_their_batches() -> None:
+    """Against a convolution written out; with many images, many networks, and both."""
+    rng = np.random.default_rng(0)
+    shapes = ((12, 7), (28, 5))
+    nets = [[(rng.normal(size=shape), rng.normal(size=shape[1:])) for shape in shapes] for _ in range(2)]
+    images = rng.normal(size=(4, 3, 5, 6))
+    expected = np.zeros((2, 4, 5 * 3 * 4))
+    for which, image in np.ndindex(2, 4):
+        x = images[image]
+        for layer in nets[which]:
+            x = convolution(x, *layer)
+        expected[which, image] = x.reshape(-1)
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *nets)
+    single = [[convolve(image, net) for image in jnp.asarray(images)] for net in jax.tree.map(jnp.asarray, nets)]
+    over_images = [jax.vmap(convolve, in_axes=(0, None))(images, net) for net in nets]
+    over_nets = jnp.stack([jax.vmap(convolve, in_axes=(None, 0))(image, stacked) for image in images], axis=1)
+    over_both = jax.vmap(jax.vmap(convolve, in_axes=(0, None)), in_axes=(None, 0))(images, stacked)
+    for name, found in {"one": single, "images": over_images, "nets": over_nets, "both": over_both}.items():
+        np.testing.assert_allclose(np.asarray(found), expected, rtol=1e-4, atol=1e-4, err_msg=name)
+
+
+def test_the_reach_critic_answers_in_the_unit_interval_for_each_goal() -> None:
+    agent, params = setup(0)
+    values = np.asarray(agent.reach_values(params, VIEW))
+    assert values.shape == (4, 2)
+    assert ((values > 0) & (values < 1)).all()
+
+
+def instruction(rows: np.ndarray, network: NetworkConfig) -> Instruction:
+    """To reach the first of the propositions (rows ``[R, P]``), avoid the second, and go on with the others."""
+    future = np.zeros(network.task_features)
+    return Instruction(reach=rows[0], avoid=rows[1], ahead=rows[2:], behind=rows[:0], future=future)
+
+
+@pytest.mark.parametrize("whole_task", [False, True])
+def test_a_scaled_task_is_a_task_with_larger_weights(whole_task: bool) -> None:
+    """What is scaled is the sub-task, and the whole task where there is no sub-task, but not what comes later."""
+    network = dataclasses.replace(small_config().network, advice=0.0, roles=False, whole_task=whole_task)
+    plain, scaled = (
+        Agent(ENV, small_config(network=dataclasses.replace(network, task_scale=scale))) for scale in (1.0, 4.0)
+    )
+    params = random_params(plain, 3)
+    rows = slice(network.latent, None if whole_task else -network.task_features)
+
+    def louder(path: Any, x: jax.Array) -> jax.Array:
+        first = jax.tree_util.keystr(path) in {f"['params']['{part}']['Dense_0']['kernel']" for part in heads}
+        return x.at[rows].multiply(4.0) if first else x
+
+    heads = ("actor", "critic")
+    told = instruction(np.eye(ENV.num_propositions, dtype=np.float32)[:2], network)
+    told = told.replace(future=np.linspace(-1, 1, network.task_features))
+    heard = {**params, "controller": jax.tree_util.tree_map_with_path(louder, params["controller"])}
+    before, after = plain.control(params, VIEW, told), scaled.control(params, VIEW, told)
+    for a, b, old in zip(after, plain.control(heard, VIEW, told), before, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
+        assert np.abs(np.asarray(a - old)).max() > 1e-3
+
+
+def test_the_low_level_turns_with_the_world() -> None:
+    """Seen through any of the eight turns, it acts as before, turned, and values what it sees alike."""
+    env = envs_jax.make("letter")
+    network = dataclasses.replace(small_config().network, lookahead=3, symmetric=True)
+    agent, turns = Agent(env, small_config(network=network)), env.symmetries
+    assert turns is not None
+    params = random_params(agent, 3)
+    letters = np.eye(env.num_propositions, dtype=np.float32)
+    told = instruction(letters, network)
+    control = quick_jit(lambda view: agent.control(params, view, told))
+    straight = 0
+    for seed in range(10):
+        observation, _ = env.reset(jax.random.key(seed), env.default_params)
+        planes, shared = env.proposition_view(observation)
+        outputs, value = control((planes, shared))
+        for bits, actions in zip(TURNS, turns.actions, strict=True):
+            again, same = control((turned(planes, *bits), shared))
+            np.testing.assert_allclose(np.asarray(again)[np.array(actions)], outputs, rtol=1e-4, atol=1e-4)
+            np.testing.assert_allclose(same, value, rtol=1e-4, atol=1e-4)
+        straight += len(np.unique(np.round(np.asarray(outputs), 3)))
+    assert straight > 20  # the outputs do tell the actions apart
+
+
+def test_the_low_level_is_reflected_with_the_world() -> None:
+    """Seen in any of the four mirrors, its actions are reflected likewise, and it values what it sees alike."""
+    env = envs_jax.make("zone", physics="closed-form")
+    network = dataclasses.replace(small_config().network, lookahead=2, symmetric=True)
+    agent, mirrors = Agent(env, small_config(network=network)), env.symmetries
+    params = random_params(agent, 3)
+    colours = np.eye(4, dtype=np.float32)
+    told = instruction(colours, network)
+    control = quick_jit(lambda view: agent.control(params, view, told))
+    rng = np.random.default_rng(0)
+    actions = set()
+    for _ in range(10):
+        lidar, shared = rng.random((4, 16)).astype(np.float32), rng.normal(size=16).astype(np.float32)
+        outputs, value = control((lidar, shared))
+        actions.add(tuple(np.sign(outputs[:2]).tolist()))
+        for k in range(4):
+            reflected = lidar[:, np.array(mirrors.features[k])], shared[np.array(mirrors.shared[k])] * mirrors.signs[k]
+            again, same = control(reflected)
+            np.testing.assert_allclose(again[:2] * np.array(mirrors.actions[k]), outputs[:2], rtol=1e-3, atol=1e-4)
+            np.testing.assert_allclose(again[2:], outputs[2:], rtol=1e-3, atol=1e-4)
+            np.testing.assert_allclose(same, value, rtol=1e-3, atol=1e-4)
+    assert len(actions) > 1

@@ -1,0 +1,117 @@
+"""Ways to the leaves, and the low level's advice on them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hrlspec.agent.agent import Agent
+from hrlspec.agent.networks.tree import lookahead, lookback, routes
+from hrlspec.spec import TaskTree, advance, initial, open_edges
+from tests.probes import Corridor, on_device, quick_jit, random_params, small_config
+from tests.trees import random_tree
+
+ENV = Corridor()
+LENGTH = 3
+
+
+def way_to(tree: TaskTree, node: int, below: int) -> list[int]:
+    """The nodes after ``node`` on the way to ``below``, by climbing; empty when it is not below."""
+    way: list[int] = []
+    here = below
+    while here != node and here != TaskTree.NO_NODE:
+        way.insert(0, here)
+        here = int(tree.parent[here])
+    return way if here == node else []
+
+
+def test_routes_are_the_ways_down() -> None:
+    rng = np.random.default_rng(0)
+    compiled = quick_jit(lambda tree, node: routes(tree, node, LENGTH))
+    for _ in range(30):
+        tree = random_tree(rng, num_nodes=10, num_propositions=4)
+        node = int(rng.integers(np.asarray(tree.valid).sum()))
+        found = np.asarray(compiled(on_device(tree), jnp.int32(node)))
+        for below in range(10):
+            way = way_to(tree, node, below)[:LENGTH] if tree.valid[below] else []
+            assert found[below].tolist() == way + [TaskTree.NO_NODE] * (LENGTH - len(way))
+
+
+def test_lookahead_collects_what_each_depth_reaches() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        tree = random_tree(rng, num_nodes=8, num_propositions=4)
+        ahead = np.asarray(lookahead(on_device(tree), 2))
+        for node in np.flatnonzero(tree.valid):
+            for steps in (1, 2):
+                below = [k for k in np.flatnonzero(tree.valid) if len(way_to(tree, node, k)) == steps]
+                np.testing.assert_array_equal(ahead[node, steps - 1], tree.reach[below].any(0))
+
+
+def test_lookback_recalls_what_was_reached_on_the_way() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(10):
+        tree = random_tree(rng, num_nodes=8, num_propositions=4)
+        behind = np.asarray(lookback(on_device(tree), 3))
+        for edge in np.flatnonzero(tree.valid)[1:]:
+            earlier = tree.reach[way_to(tree, TaskTree.ROOT, edge)[-2::-1]][:3]
+            np.testing.assert_array_equal(behind[edge], np.pad(earlier, ((0, 3 - len(earlier)), (0, 0))))
+
+
+def test_the_low_level_remembers_as_much_as_it_is_told_to() -> None:
+    """Two ways to the same last sub-task: what it is worth may depend on them, as a bonus for an order does."""
+    a, b, c = np.eye(ENV.num_propositions, dtype=bool)[:3]
+    tree = on_device(
+        TaskTree(
+            parent=np.array([-1, 0, 0, 1, 2], np.int32),
+            reach=np.stack([a & b, a, b, c, c]),
+            avoid=np.zeros((5, ENV.num_propositions), bool),
+            accepting=np.array([False, False, False, True, True]),
+            valid=np.ones(5, bool),
+            depth=np.array([0, 1, 1, 2, 2], np.int32),
+        )
+    )
+    for memory in (0, 1):
+        network = dataclasses.replace(small_config().network, roles=True, memory=memory)
+        agent = Agent(ENV, small_config(network=network))
+        params = random_params(agent, 4)
+        told = agent.instruct(params, tree)
+        last = [jax.tree.map(lambda x, e=edge: x[e], told) for edge in (3, 4)]
+        values = [float(agent.control(params, ENV.view_at(2), some)[1]) for some in last]
+        assert (abs(values[0] - values[1]) > 1e-3) == bool(memory)
+
+
+def test_advice_is_the_value_of_the_best_way_and_that_way_is_handed_down() -> None:
+    base = small_config().network
+    network = dataclasses.replace(base, roles=True, lookahead=LENGTH, advice=10.0, advised=12)
+    agent = Agent(ENV, small_config(network=network))
+    params, view = random_params(agent, 2), ENV.view_at(2)
+    control = quick_jit(lambda told: agent.control(params, view, told)[1])
+    advise = quick_jit(lambda *batch: agent.advise(params, *batch))
+    rng = np.random.default_rng(2)
+    several = 0
+    for _ in range(20):
+        tree = on_device(random_tree(rng, num_nodes=9, num_propositions=ENV.num_propositions, distinct=True))
+        labels = jnp.asarray(rng.random(ENV.num_propositions) < 0.4)
+        state = advance(tree, initial(tree), labels, TaskTree.NO_NODE)
+        told = agent.instruct(params, tree)
+        batch = jax.tree.map(lambda x: x[None], (view, tree, state, told))
+        advice, ahead = jax.tree.map(lambda x: x[0], advise(*batch))
+        for edge in np.flatnonzero(open_edges(tree, state)):
+            scores = {}
+            for leaf in np.flatnonzero(tree.accepting):
+                way = way_to(tree, int(state.node), leaf)
+                if way and way[0] == edge:
+                    later = np.zeros((LENGTH, ENV.num_propositions), np.float32)
+                    for i, node in enumerate(way[1 : 1 + LENGTH]):
+                        later[i] = tree.reach[node]
+                    mine = dataclasses.replace(jax.tree.map(lambda x, e=edge: x[e], told), ahead=jnp.asarray(later))
+                    scores[leaf] = float(control(mine)), later
+            several += len(scores) > 1
+            best, later = max(scores.values(), key=lambda score: score[0])
+            np.testing.assert_allclose(advice[edge], best, rtol=1e-5)
+            np.testing.assert_array_equal(ahead[edge], later)
+    assert several > 3

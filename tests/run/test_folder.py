@@ -1,0 +1,274 @@
+"""A run folder belongs to one run and one process, and no row of metrics is lost or written twice."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tensorboardX.proto import event_pb2
+
+from hrlspec.run.errors import UserError
+from hrlspec.run.folder import config_hash, open_run, read_metrics, read_record
+
+ROOT = Path(__file__).parents[2]
+
+
+@dataclasses.dataclass(frozen=True)
+class Network:
+    sizes: tuple[int, ...] = (64, 32)
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    seed: int = 0
+    total_steps: int = 10
+    rate: float = 1e-3
+    network: Network = Network()
+
+
+def events(file: Path) -> list[event_pb2.Event]:
+    """The records of an event file: length, its checksum, content, its checksum."""
+    found, content = [], file.read_bytes()
+    while content:
+        (length,) = struct.unpack("<Q", content[:8])
+        found.append(event_pb2.Event.FromString(content[12 : 12 + length]))
+        content = content[16 + length :]
+    return found
+
+
+def scalars(file: Path) -> list[tuple[int, float]]:
+    return [(event.step, value.simple_value) for event in events(file) for value in event.summary.value]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_new_run_records_what_it_is(tmp_path: Path) -> None:
+    with open_run(tmp_path / "a" / "run", Config()) as run:
+        assert not run.resumed
+        assert run.checkpoints == tmp_path / "a" / "run" / "checkpoints"
+        assert run.plots.is_dir()
+        run.write_summary({"success": np.float32(0.5), "by_depth": {2: jnp.ones(2)}})
+    record = read_record(run.path)
+    assert record["config"] == run.config
+    assert run.config == {"seed": 0, "total_steps": 10, "rate": 1e-3, "network": {"sizes": [64, 32]}}
+    assert record["config_hash"] == run.config_hash == config_hash(run.config)
+    assert {"hrlspec", "jax", "numpy", "python"} <= record["versions"].keys()
+    assert record["commit"] is None or len(record["commit"].removesuffix("+changes")) == 40
+    assert json.loads((run.path / "summary.json").read_text()) == {"success": 0.5, "by_depth": {"2": [1.0, 1.0]}}
+
+
+def test_the_commit_is_that_of_the_code_not_of_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    head = subprocess.run(["git", "-C", str(ROOT), "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
+    if head.returncode:
+        pytest.skip("not a git checkout")
+    with open_run("run", Config()):
+        pass
+    assert read_record("run")["commit"].removesuffix("+changes") == head.stdout.strip()
+
+
+def test_the_hash_depends_on_values_not_on_order() -> None:
+    assert config_hash({"a": 1, "b": {"c": 2, "d": 3}}) == config_hash({"b": {"d": 3, "c": 2}, "a": 1})
+    assert config_hash({"a": 1}) != config_hash({"a": 2})
+
+
+def test_rows_are_plain_json_and_go_to_tensorboard(tmp_path: Path) -> None:
+    with open_run(tmp_path, Config()) as run:
+        run.append({"env_steps": 0, "loss": float("nan"), "eval/by_depth": {"2": np.array([0.5])}})
+        run.append({"env_steps": np.int64(2**33), "loss": jnp.float32(0.25), "method": "ours"})
+    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line, parse_constant=pytest.fail) for line in lines] == read_metrics(tmp_path)
+    assert read_metrics(tmp_path) == [
+        {"env_steps": 0, "loss": None, "eval/by_depth": {"2": [0.5]}},
+        {"env_steps": 2**33, "loss": 0.25, "method": "ours"},
+    ]
+    (file,) = (tmp_path / "tensorboard").iterdir()
+    assert scalars(file) == [(2**33, 0.25)]
+
+
+def test_bad_rows_are_bugs(tmp_path: Path) -> None:
+    with open_run(tmp_path, Config(), tensorboard=False) as run:
+        run.append({"env_steps": 5})
+        with pytest.raises(ValueError, match="needs an integer env_steps"):
+            run.append({"loss": 1.0})
+        with pytest.raises(ValueError, match="env_steps 4 after one of 5"):
+            run.append({"env_steps": 4})
+        with pytest.raises(TypeError, match="no form in JSON"):
+            run.append({"env_steps": 6, "what": object()})
+    assert read_metrics(tmp_path) == [{"env_steps": 5}]
+    assert not (tmp_path / "tensorboard").exists()
+
+
+def test_a_resumed_run_has_each_row_once(tmp_path: Path) -> None:
+    with open_run(tmp_path, Config()) as run:
+        for step in (0, 10, 20, 30):
+            run.append({"env_steps": step, "process": 1})
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('{"env_steps": 40, "pro')  # killed while writing
+    assert [row["env_steps"] for row in read_metrics(tmp_path)] == [0, 10, 20, 30]
+    with open_run(tmp_path, Config(), resume=True) as run:
+        assert run.resumed
+        with pytest.raises(RuntimeError, match="rewind"):
+            run.append({"env_steps": 20})
+        assert run.rewind(10) == 3
+        for step in (20, 30):
+            run.append({"env_steps": step, "process": 2})
+    rows = [(row["env_steps"], row["process"]) for row in read_metrics(tmp_path)]
+    assert rows == [(0, 1), (10, 1), (20, 2), (30, 2)]
+    record = read_record(tmp_path)
+    assert set(record["earlier"][0]) == set(record) - {"format", "config", "config_hash", "earlier"}
+    first, second = sorted((tmp_path / "tensorboard").iterdir(), key=lambda file: file.suffix)
+    assert [step for step, _ in scalars(first)] == [0, 10, 20, 30]
+    assert scalars(second) == [(20, 2.0), (30, 2.0)]
+    # TensorBoard drops what earlier files hold from the step of this record on.
+    assert [event.step for event in events(second) if event.HasField("session_log")] == [11]
+    with open_run(tmp_path, Config(), resume=True) as run:
+        assert run.rewind(-1) == 4
+        run.append({"env_steps": 0})
+    assert read_metrics(tmp_path) == [{"env_steps": 0}]
+    assert len(read_record(tmp_path)["earlier"]) == 2
+
+
+def test_another_run_is_never_touched(tmp_path: Path) -> None:
+    with open_run(tmp_path, Config()) as run:
+        run.append({"env_steps": 1})
+    before = contents(tmp_path)
+    for config in (Config(), Config(seed=1)):
+        with (
+            pytest.raises(UserError, match="holds a run already: continue it with --resume"),
+            open_run(tmp_path, config),
+        ):
+            pass
+    with (
+        pytest.raises(UserError, match="begun with seed = 0, not 1: "),
+        open_run(tmp_path, Config(seed=1), resume=True),
+    ):
+        pass
+    other = Config(seed=1, network=Network((1,)))
+    with (
+        pytest.raises(UserError, match=r"network.sizes = \[64, 32\], not \[1\] \(1 more differ\)"),
+        open_run(tmp_path, other, resume=True),
+    ):
+        pass
+    assert contents(tmp_path) == before
+
+
+def test_what_may_change_is_recorded(tmp_path: Path) -> None:
+    with open_run(tmp_path, Config()):
+        pass
+    with open_run(tmp_path, Config(total_steps=20), resume=True, may_change=("total_steps",)) as run:
+        run.rewind(-1)
+    assert read_record(tmp_path)["config"]["total_steps"] == 20
+
+
+def test_places_that_are_refused_stay_as_they_are(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("x")
+    before = contents(tmp_path)
+    for name, resume, message in [
+        ("file", False, "is a file"),
+        ("file/below", False, "cannot write to .*: Not a directory"),
+        ("full", False, "is not empty and holds no run"),
+        ("full", True, "no run to resume"),
+        ("missing", True, "no run to resume"),
+        ("n" * 300, False, "cannot write to .*: File name too long"),
+    ]:
+        with pytest.raises(UserError, match=message), open_run(tmp_path / name, Config(), resume=resume):
+            pass
+    assert contents(tmp_path) == before
+    assert not (tmp_path / "missing").exists()
+
+
+def test_a_folder_without_permission_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(self: Path, *args: object, **kwargs: object) -> None:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)  # modes do not bind a superuser
+    with pytest.raises(UserError, match=r"run: Permission denied"), open_run(tmp_path / "run", Config()):
+        pass
+
+
+def test_an_error_inside_is_not_dressed_up(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), open_run(tmp_path, Config()):
+        raise FileNotFoundError
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "cannot read"),
+        ("[]", "not the record of a run"),
+        ('{"format": 99, "config": {}}', "not the record of a run"),
+        ('{"format": 1, "config": 3}', "not the record of a run"),
+        ('{"format": 1, "config": {"seed": 7}, "config_hash": "0"}', "changed by hand"),
+        ("\ud800", "cannot read"),
+    ],
+)
+def test_damaged_records_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "config.json").write_bytes(text.encode(errors="surrogatepass"))
+    with pytest.raises(UserError, match=message):
+        read_record(tmp_path)
+    with pytest.raises(UserError, match=message), open_run(tmp_path, Config(), resume=True):
+        pass
+
+
+def test_folders_that_are_not_runs(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="is not a run folder"):
+        read_record(tmp_path)
+    assert read_metrics(tmp_path) == []
+    (tmp_path / "metrics.jsonl").write_text('{"env_steps": 1}\nnonsense\n{"env_steps": 2}\n')
+    with pytest.raises(UserError, match="line 2: not a row"):
+        read_metrics(tmp_path)
+
+
+HOLDER = """
+import sys, time
+from hrlspec.run.folder import open_run
+with open_run(sys.argv[1], {"seed": 0}, tensorboard=False) as run:
+    run.append({"env_steps": 1})
+    print("open", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_two_processes_never_write_the_same_folder(tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLDER, str(tmp_path)],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        env=dict(os.environ, JAX_PLATFORMS="cpu"),
+    )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "open\n"
+        with pytest.raises(UserError, match="another process is writing"), open_run(tmp_path, {"seed": 0}, resume=True):
+            pass
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+    # The lock of a killed process is gone.
+    with open_run(tmp_path, {"seed": 0}, resume=True, tensorboard=False) as run:
+        assert run.rewind(1) == 0
+    assert read_metrics(tmp_path) == [{"env_steps": 1}]
+
+
+def test_a_process_killed_at_its_start_leaves_nothing_in_the_way(tmp_path: Path) -> None:
+    (tmp_path / ".lock").touch()
+    (tmp_path / ".config.json.new").write_text("{")
+    with open_run(tmp_path, Config()) as run:
+        assert not run.resumed

@@ -1,0 +1,95 @@
+"""XLA's flags and the compilation cache: set where nothing was, and the user's left alone."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import pytest
+
+from hrlspec.run.platform import compiled_quickly, with_loop_option
+
+ROOT = Path(__file__).parents[2]
+OPTION = "xla_cpu_small_while_loop_byte_threshold=65536"
+
+
+@pytest.mark.parametrize(
+    ("flags", "version", "expected"),
+    [
+        ("", (0, 10, 2), f"--xla_backend_extra_options={OPTION}"),
+        ("", (0, 12, 0), ""),
+        ("--xla_a=1", (0, 11, 0), f"--xla_a=1 --xla_backend_extra_options={OPTION}"),
+        ("--xla_backend_extra_options=x --xla_a=1", (0, 10), f"--xla_backend_extra_options=x,{OPTION} --xla_a=1"),
+        (
+            "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=7",
+            (0, 10),
+            "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=7",
+        ),
+        ("--xla_a=1", (0, 12, 1), "--xla_a=1"),
+    ],
+)
+def test_the_option_for_loops(flags: str, version: tuple[int, ...], expected: str) -> None:
+    assert with_loop_option(flags, version) == expected
+    assert with_loop_option(expected, version) == expected
+
+
+def test_the_level_of_optimisation_is_the_users_to_choose() -> None:
+    ours = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
+    assert compiled_quickly("--xla_a=1") == f"--xla_a=1 {ours}"
+    assert compiled_quickly(ours) == ours
+    mine = "--xla_cpu_use_fusion_emitters=true --xla_backend_optimization_level=3 --xla_a=1"
+    assert compiled_quickly(mine) == mine
+
+
+SCRIPT = """
+import os, sys
+from hrlspec.run import platform
+import jax
+before = dict(os.environ)
+platform.prepare(*sys.argv[1:])
+import jax.numpy as jnp
+assert float(jax.jit(lambda x: x + 1)(jnp.ones(()))) == 2  # XLA knows the flags
+print(jax.config.jax_compilation_cache_dir)
+print(jax.config.jax_persistent_cache_min_compile_time_secs)
+print(os.environ["XLA_FLAGS"])
+"""
+
+
+def prepared(env: str = "letter", recipe: str = "hrlspec", **environment: str) -> list[str]:
+    names = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "XLA_FLAGS")
+    clean = {name: value for name, value in os.environ.items() if name not in names}
+    ended = subprocess.run(
+        [sys.executable, "-c", SCRIPT, env, recipe],
+        cwd=ROOT,
+        env=clean | environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    return ended.stdout.splitlines()
+
+
+def test_the_cache_belongs_to_user_and_version(tmp_path: Path) -> None:
+    import jaxlib.version
+
+    folder, least, flags = prepared(XDG_CACHE_HOME=str(tmp_path), JAX_PLATFORMS="cpu")
+    assert folder == f"{tmp_path}/hrlspec/jaxlib-{jaxlib.version.__version__}"
+    assert float(least) == 0.2
+    assert flags == compiled_quickly(with_loop_option("", jax.__version_info__))
+
+
+@pytest.mark.parametrize(("env", "recipe"), [("zone-nm", "hrlspec"), ("walk", "paper")])
+def test_what_gains_from_it_is_optimised_in_full(env: str, recipe: str) -> None:
+    *_, flags = prepared(env, recipe, JAX_PLATFORMS="cpu")
+    assert "optimization_level" not in flags
+
+
+def test_what_the_user_set_stays(tmp_path: Path) -> None:
+    mine = str(tmp_path / "mine")
+    folder, least, _ = prepared(JAX_COMPILATION_CACHE_DIR=mine, JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS="3")
+    assert folder == mine
+    assert float(least) == 3

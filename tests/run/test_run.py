@@ -1,0 +1,305 @@
+"""``hrlspec.run.commands.run`` for real, on a tiny agent: what it leaves, and that nothing stops it for good."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+from PIL import Image
+
+from hrlspec import checkpoint
+from hrlspec.checkpoint import state_hash
+from hrlspec.run.commands import evaluate, run
+from hrlspec.run.errors import main_guard
+from hrlspec.run.experiment import experiment_of, experiments_of, parse_run
+from hrlspec.run.folder import read_metrics, read_record
+from hrlspec.run.learner import Learner
+from hrlspec.run.progress import ProgressDisplay
+from tests.experiments import tiny
+
+ROOT = Path(__file__).parents[2]
+PATIENCE = 900  # seconds; a busy machine may need most of it to load the programs
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_programs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A compilation cache that this process and those it starts share."""
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(tmp_path_factory.mktemp("jax"))
+    before = (
+        jax.config.values["jax_compilation_cache_dir"],
+        jax.config.values["jax_persistent_cache_min_compile_time_secs"],
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", folder)
+        patch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
+        jax.config.update("jax_compilation_cache_dir", folder)
+        compilation_cache.reset_cache()  # it looks at its configuration once
+        yield
+    jax.config.update("jax_compilation_cache_dir", before[0])
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", before[1])
+    compilation_cache.reset_cache()
+
+
+def call(*argv: str) -> int:
+    return main_guard(lambda: run.main(argv))
+
+
+def rows(folder: Path) -> list[dict[str, Any]]:
+    return [{k: v for k, v in row.items() if k not in ("wall_s", "train/steps_per_s")} for row in read_metrics(folder)]
+
+
+def final_hash(folder: Path) -> str:
+    """Of the training state in the last checkpoint."""
+    learner = Learner(experiment_of(read_record(folder)["config"], str(folder)))
+    restored = checkpoint.load(folder / "checkpoints", learner.job().init())
+    assert restored.step == tiny.TOTAL
+    assert restored.skipped == ()
+    return state_hash(restored.state)
+
+
+def results(folder: Path) -> Any:
+    return json.loads((folder / "summary.json").read_text())["final"]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An uninterrupted run."""
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    assert call(*tiny.arguments(folder)) == 0
+    return folder
+
+
+def test_what_a_run_leaves(finished: Path) -> None:
+    record = read_record(finished)
+    assert record["config"]["config"]["num_envs"] == 8
+    assert record["config"]["config"]["total_steps"] == tiny.TOTAL
+    assert [row["env_steps"] for row in read_metrics(finished)] == [400, 800, 960]
+    for row in read_metrics(finished):
+        expected = {"wall_s", "level", "eval/return_mean", "eval/success_rate", "eval/steps_mean", "eval/spl"}
+        expected |= {"train/steps_per_s", "train/success_rate", "controller/policy_loss", "planner/transe_loss"}
+        assert expected <= row.keys()
+        assert 0 <= row["eval/success_rate"] <= 1
+        assert row["level"] in (1, 2)
+    summary = json.loads((finished / "summary.json").read_text())
+    assert summary["env_steps"] == tiny.TOTAL
+    suite = summary["final"]["suite"]
+    assert suite["episodes"] == 20
+    assert len(suite["per_task"]) == 2
+    assert 0 <= suite["spl"] <= suite["success_rate"] <= 1
+    assert (finished / "tensorboard").is_dir()
+    assert checkpoint.steps(finished / "checkpoints")[-1] == tiny.TOTAL
+    assert {"plots/curves.png", "plots/episode.gif", "plots/example_4.png", "plots/task_2.png"} <= set(
+        summary["pictures"]
+    )
+    for picture in summary["pictures"]:
+        with Image.open(finished / picture) as image:
+            assert min(image.size) > 100
+
+
+def test_a_finished_run_is_left_alone(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {file: file.stat().st_mtime_ns for file in finished.rglob("*")}
+    assert call(*tiny.arguments(finished)) == 2
+    assert "holds a run already" in capsys.readouterr().err
+    assert call(*tiny.arguments(finished, "--resume", "--seed", "1")) == 2
+    assert "finished run with other settings" in capsys.readouterr().err
+    assert call(*tiny.arguments(finished, "--resume")) == 0
+    assert "is finished" in capsys.readouterr().out
+    assert {file: file.stat().st_mtime_ns for file in finished.rglob("*")} == before
+
+
+@contextmanager
+def running(folder: Path, *more: str) -> Iterator[subprocess.Popen[str]]:
+    """A run in a process of its own, which is gone when the context ends, whatever happens."""
+    command = [sys.executable, "-m", "experiments.run", *tiny.arguments(folder, "--checkpoint-minutes", "0", *more)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def wait_for_step(folder: Path, least: int, process: subprocess.Popen[str]) -> None:
+    end = time.monotonic() + PATIENCE
+    while not any(step >= least for step in checkpoint.steps(folder / "checkpoints")):
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def flip_a_bit(folder: Path) -> None:
+    """In the arrays of the newest checkpoint."""
+    newest = sorted((folder / "checkpoints").glob("step_*"))[-1]
+    file = max((newest / "arrays").rglob("*"), key=lambda path: path.stat().st_size if path.is_file() else -1)
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 16
+    file.write_bytes(content)
+
+
+def test_terminated_killed_and_damaged_it_ends_as_if_left_in_peace(
+    finished: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "run"
+    with running(folder) as process:
+        wait_for_step(folder, 1, process)
+        process.send_signal(signal.SIGTERM)
+        said = process.communicate(timeout=PATIENCE)[1].strip().splitlines()[-1]
+        assert process.returncode == 130
+    assert said.startswith("interrupted: SIGTERM after ")
+    stopped = checkpoint.steps(folder / "checkpoints")[-1]
+    assert f"SIGTERM after {stopped} of {tiny.TOTAL} environment steps" in said
+    assert stopped < tiny.TOTAL - 2 * tiny.STEPS
+
+    with running(folder, "--resume") as process:
+        wait_for_step(folder, stopped + 2 * tiny.STEPS, process)
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        assert process.returncode == -signal.SIGKILL
+
+    flip_a_bit(folder)
+    assert call(*tiny.arguments(folder, "--resume")) == 0
+    assert "does not match its SHA-256; falling back to step" in caplog.text
+    assert final_hash(folder) == final_hash(finished)
+    assert rows(folder) == rows(finished)
+    assert results(folder) == results(finished)
+
+
+def test_a_signal_during_the_final_evaluation(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    evaluate_finally = Learner.final_results
+
+    def interrupted(self: Learner, params: Any) -> Any:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return evaluate_finally(self, params)
+
+    monkeypatch.setattr(Learner, "final_results", interrupted)
+    assert call(*tiny.arguments(folder)) == 130
+    assert capsys.readouterr().err.splitlines()[-1].startswith("interrupted: during the final evaluation")
+    assert not (folder / "summary.json").exists()
+    monkeypatch.undo()
+    assert call(*tiny.arguments(folder, "--resume")) == 0
+    assert rows(folder) == rows(finished)
+    assert results(folder) == results(finished)
+
+
+def test_several_seeds_skip_what_is_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = tiny.arguments(tmp_path, "--num-seeds", "2", "--seed", "3")
+    advance, calls = ProgressDisplay.advance, 0
+
+    def stop_in_the_second_run(self: ProgressDisplay, env_steps: int, metrics: Any) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == tiny.ITERATIONS + 4:
+            os.kill(os.getpid(), signal.SIGTERM)
+        advance(self, env_steps, metrics)
+
+    monkeypatch.setattr(ProgressDisplay, "advance", stop_in_the_second_run)
+    assert call(*flags) == 130
+    assert (tmp_path / "seed3" / "summary.json").exists()
+    assert not (tmp_path / "seed4" / "summary.json").exists()
+    monkeypatch.undo()
+    capsys.readouterr()
+    assert call(*flags) == 2
+    assert "seed3 holds a run already" in capsys.readouterr().err
+    assert call(*flags, "--resume") == 0
+    out = capsys.readouterr().out
+    assert "seed3 is finished" in out
+    assert "seeds 3 to 4" in out
+    assert "interquartile mean" in out
+    assert results(tmp_path / "seed3") != results(tmp_path / "seed4")
+
+
+def test_parameters_that_are_not_finite_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    iterate, advance, skipped = Learner._iterate, ProgressDisplay.advance, []
+
+    def poisoned(self: Learner, state: Any, index: int) -> Any:
+        if index == 2:
+            state = state.replace(params=jax.tree.map(lambda x: x * jnp.nan, state.params))
+        return iterate(self, state, index)
+
+    def watch(self: ProgressDisplay, env_steps: int, metrics: Any) -> None:
+        skipped.append(metrics["controller/skipped"])
+        advance(self, env_steps, metrics)
+
+    monkeypatch.setattr(Learner, "_iterate", poisoned)
+    monkeypatch.setattr(ProgressDisplay, "advance", watch)
+    with pytest.raises(SystemExit) as stop:  # a message instead of a number: printed, and status 1
+        call(*tiny.arguments(tmp_path / "run"))
+    assert str(stop.value).startswith("error: parameters are not finite at environment step 400; nothing was saved")
+    assert skipped == [0, 0, 1, 1, 1]
+    assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+# An agent from such a run, evaluated. Two trees of 9 to 16 nodes and 20 episodes: the program is compiled already.
+LARGE = "achieve a; achieve b; achieve c; (achieve d or achieve e); achieve b; achieve a; achieve c"
+
+
+def test_evaluate_prints_one_json_object(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    specs = tmp_path / "tasks.txt"
+    specs.write_text(f"# two tasks\n{LARGE}\n\nachieve a # the first letter\n")
+    flags = ["--run", str(finished), "--spec-file", str(specs), "--episodes", "20", "--json"]
+    assert main_guard(lambda: evaluate.main(flags)) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert out.count("\n") == 1
+    report = json.loads(out, parse_constant=pytest.fail)
+    expected = {"success_rate", "return_mean", "steps_mean", "spl", "episodes", "per_task", "run", "checkpoint_step"}
+    assert expected | {"success_rate_interval", "spl_interval"} <= report.keys()
+    assert report["episodes"] == 20
+    assert report["checkpoint_step"] == tiny.TOTAL
+    assert [task["task"] for task in report["per_task"]] == [LARGE, "achieve a"]
+    assert [task["episodes"] for task in report["per_task"]] == [10, 10]
+    assert main_guard(lambda: evaluate.main(flags)) == 0
+    assert json.loads(capsys.readouterr().out) == report  # seeded
+    assert main_guard(lambda: evaluate.main([*flags, "--seed", "1"])) == 0
+    assert json.loads(capsys.readouterr().out)["per_task"] != report["per_task"]
+
+
+def test_evaluate_prints_a_table(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flags = ["--run", str(finished), "--spec", LARGE, "--episodes", "20", "--step", str(tiny.TOTAL)]
+    assert main_guard(lambda: evaluate.main(flags)) == 0
+    out = capsys.readouterr().out
+    assert "depth 7" in out
+    assert "SPL" in out
+    assert all(len(line) <= 100 and "…" not in line for line in out.splitlines())
+
+
+def test_a_damaged_checkpoint_is_not_evaluated_silently(
+    finished: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    newest = sorted((finished / "checkpoints").glob("step_*"))[-1]
+    manifest = newest / "manifest.json"
+    intact = manifest.read_bytes()
+    manifest.write_bytes(intact.replace(b"float32", b"float64", 1))
+    try:
+        flags = ["--run", str(finished), "--spec", LARGE, "--step", str(tiny.TOTAL)]
+        assert main_guard(lambda: evaluate.main(flags)) == 2
+        assert "is damaged" in capsys.readouterr().err
+    finally:
+        manifest.write_bytes(intact)
+    del caplog
+
+
+def test_experiments_survive_their_record(tmp_path: Path) -> None:
+    ((experiment, folder),) = experiments_of(parse_run(tiny.arguments(tmp_path / "x", "--env", "letter12")))
+    assert folder == tmp_path / "x"
+    from hrlspec.run.folder import open_run
+
+    with open_run(tmp_path / "x", experiment, tensorboard=False):
+        pass
+    assert experiment_of(read_record(tmp_path / "x")["config"], "x") == experiment

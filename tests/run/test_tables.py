@@ -1,0 +1,83 @@
+"""Result tables: right numbers, and nothing wraps in a terminal of 80 columns."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+
+import pytest
+from rich.console import Console
+
+from hrlspec.evaluation import Aggregate, ChoiceResult, ReturnResult, Score, SuiteResult, TaskScore
+from hrlspec.evaluation.stats import Interval
+from hrlspec.run.learner import FinalResults
+from hrlspec.run.tables import aggregate_table, final_tables, suite_table
+
+NAN = float("nan")
+
+
+def score(success: float, *, spl: bool = True) -> Score:
+    return Score(
+        episodes=1000,
+        success_rate=Interval(success, success - 0.1, 1.0),
+        violation_rate=Interval(0.012, 0.0, 0.1),
+        return_mean=Interval(success, -0.123, 1.2),
+        steps_mean=Interval(12.345, 11.111, 13.9) if success else Interval(NAN, NAN, NAN),
+        spl=Interval(0.5, NAN, NAN) if spl else None,
+        optimal_steps_mean=10.0 if spl else None,
+        myopic_success_rate=0.9 if spl else None,
+        myopic_spl=0.8 if spl else None,
+    )
+
+
+def result(*, spl: bool = True) -> SuiteResult:
+    per_task = tuple(TaskScore(f"achieve {name}", 2, score(0.75, spl=spl)) for name in "ab")
+    depths = {4: score(0.0, spl=spl), 2: score(1.0, spl=spl)}
+    return SuiteResult("dag", False, True, 3, score(0.983, spl=spl), depths, per_task)
+
+
+def lines(table: object) -> list[str]:
+    stream = io.StringIO()
+    Console(file=stream, width=80).print(table)
+    found = [line.rstrip() for line in stream.getvalue().splitlines()]
+    assert all("…" not in line for line in found)
+    return found
+
+
+def test_a_suite() -> None:
+    found = lines(suite_table(result()))
+    assert "Unseen tasks: dag (2 tasks, 1000 episodes)" in found[0]
+    (row,) = [line.split() for line in found if line.strip().startswith("all ")]
+    assert row == ["all", "0.983", "[.88,1.00]", "0.983", "[-.12,1.20]", "12.3", "[11.1,13.9]", "0.500"]
+    (failed,) = [line.split() for line in found if line.strip().startswith("depth 4")]
+    assert failed[5:] == ["[-.12,1.20]", "-", "0.500"]
+    text = " ".join(" ".join(found).split())
+    for remark in ("sampled actions", "shield on", "violated: 0.012", "3 cases", "over optimum: 1.23", "SPL 0.800"):
+        assert remark in text
+
+
+def test_bounds_lose_their_leading_zero_alone() -> None:
+    total = dataclasses.replace(score(0.5), steps_mean=Interval(9.925, 9.56, 10.29))
+    assert "[9.56,10.29]" in "".join(lines(suite_table(dataclasses.replace(result(), total=total))))
+
+
+def test_without_an_exact_solver_there_is_no_spl() -> None:
+    assert "SPL" not in "\n".join(lines(suite_table(result(spl=False))))
+
+
+def test_what_a_run_ends_with() -> None:
+    choice = ChoiceResult(False, 400, *[Interval(0.9, 0.85, 0.95)] * 3, failures=0.01)
+    returns = ReturnResult("branches", False, 100, 5, Interval(0.95, 0.9, 1.0), Interval(1, 1, 1), 0.5, 0.75, {})
+    text = "\n".join("\n".join(lines(table)) for table in final_tables(FinalResults(result(), choice, returns)))
+    assert "Contested choice (400 layouts)" in text
+    assert "0.900 [.85,.95]" in text
+    assert "0.950 [.90,1.00]" in text
+    assert "0.750" in text
+    assert len(final_tables(FinalResults(result(), None, None))) == 1
+
+
+@pytest.mark.parametrize("iqm", [None, Interval(0.97, 0.96, 0.98)])
+def test_several_seeds(iqm: Interval | None) -> None:
+    found = "\n".join(lines(aggregate_table("name", {"spl": Aggregate(3, Interval(0.96, 0.9, 1.02), iqm)})))
+    assert "0.960 [.90,1.02]" in found
+    assert ("0.970" in found) == (iqm is not None)
