@@ -9,19 +9,38 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-from envs_jax.base import Box, Discrete, Environment, EnvParams, Reflections, Symmetries
+from envs_jax.base import (
+    Box,
+    ContestedChoice,
+    ContestedLayouts,
+    Discrete,
+    Drawable,
+    Environment,
+    EnvParams,
+    FiniteGraph,
+    GridMap,
+    Reflections,
+    Symmetric,
+    Symmetries,
+)
 from envs_jax.layouts import load_layouts, save_layouts
 from envs_jax.letter.world import Letter, LetterState
 from envs_jax.walk.world import Walk, WalkLayout, WalkState, flatworld
 
 __all__ = [
     "Box",
+    "ContestedChoice",
+    "ContestedLayouts",
     "Discrete",
+    "Drawable",
     "EnvParams",
     "Environment",
+    "FiniteGraph",
+    "GridMap",
     "Letter",
     "LetterState",
     "Reflections",
+    "Symmetric",
     "Symmetries",
     "Walk",
     "WalkLayout",

@@ -3,7 +3,10 @@
 An environment is a static, hashable value (sizes, names) whose methods are pure functions of arrays. All of
 them are written for one unbatched item: ``vmap`` at the edge. Keys are consumed.
 
-Axes: **P** atomic propositions, **S** states of a finite environment, **A** its actions.
+What only some environments can do is a capability: an abstract class below :class:`Environment`. A world inherits
+those it has, and who needs one asks ``isinstance(env, FiniteGraph)``.
+
+Axes: **P** atomic propositions, **S** states of a finite environment, **A** its actions, **X**, **Y** places of a grid.
 """
 
 from __future__ import annotations
@@ -16,6 +19,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+
+from envs_jax.scenes import Scene
 
 Layout = Any
 """What a reset may vary (where the letters or zones lie): a pytree of arrays."""
@@ -157,9 +162,10 @@ class Environment(abc.ABC):
     def action_space(self) -> Discrete | Box:
         """Where actions lie."""
 
+    # Read of every environment until agents ask for Symmetric.
     @property
     def symmetries(self) -> Symmetries | Reflections | None:
-        """Set where turning or reflecting all that is seen changes nothing but the actions' names or signs."""
+        """See :class:`Symmetric`."""
         return None
 
     @property
@@ -236,3 +242,105 @@ class Environment(abc.ABC):
         state = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, stepped)
         info = {**info, "final_observation": final_observation}
         return observation, state, reward, terminated, truncated, info
+
+
+class Symmetric(Environment):
+    """An environment that stays the same when all that is seen is turned or reflected, and actions with it."""
+
+    @property
+    @abc.abstractmethod
+    def symmetries(self) -> Symmetries | Reflections | None:
+        """How observations and actions are turned or reflected; ``None`` for sizes at which nothing can be."""
+
+
+class FiniteGraph(Environment):
+    """An environment that is a finite labelled graph with deterministic steps, for exact solvers."""
+
+    @abc.abstractmethod
+    def transition_table(self, layout: Layout, params: EnvParams) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """The graph of a layout.
+
+        Returns:
+            ``(successors int32 [S, A], labels bool [S, P], start int32 [])``: the state that each action leads to, the
+            propositions that hold in each state, and the state in which episodes begin.
+        """
+
+    @abc.abstractmethod
+    def graph_state(self, state: State) -> jax.Array:
+        """Which of the S states of :meth:`transition_table` the environment is in, int32 ``[]``."""
+
+
+class GridMap(Environment):
+    """An environment in the plane whose whole steps lead from places of a grid to their neighbours, or nowhere."""
+
+    @abc.abstractmethod
+    def grid(self, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The places that whole steps lead to. On the host.
+
+        Args:
+            layout: unbatched, numpy leaves.
+
+        Returns:
+            ``(labels bool [X, Y, P], inside bool [X, Y], start int [2])``: the propositions that hold in each place,
+            whether it may be entered, and the place where episodes begin.
+        """
+
+
+class ContestedLayouts(Environment):
+    """An environment that draws layouts on which the nearest goal is often not the one to begin with."""
+
+    @abc.abstractmethod
+    def contested_layout(self, key: jax.Array, first: jax.Array, second: jax.Array, params: EnvParams) -> Layout:
+        """A random layout for the task "first, then second" on which going to the nearest first costs steps later.
+
+        Args:
+            key: consumed.
+            first: bool ``[P]``, what is to be reached first.
+            second: bool ``[P]``, what is to be reached after it.
+            params: of the environment.
+
+        Returns:
+            An unbatched layout; one of :meth:`sample_layout` where the task is not of two different propositions.
+        """
+
+
+class ContestedChoice(ContestedLayouts):
+    """An environment whose contested layouts also serve evaluation; for those without an exact solver.
+
+    There are two instances of the first proposition, and the way a layout is drawn says which is the right one.
+    """
+
+    @property
+    @abc.abstractmethod
+    def contested_pairs(self) -> tuple[tuple[int, int], ...]:
+        """Indices of (first, second) propositions that contested layouts can be about."""
+
+    @abc.abstractmethod
+    def instance_at(self, state: State, goal: jax.Array) -> jax.Array:
+        """Which instance of a proposition (``goal``, one-hot bool ``[P]``) the agent is nearest to, int32 ``[]``."""
+
+    @abc.abstractmethod
+    def contested_layout(
+        self, key: jax.Array, first: jax.Array, second: jax.Array, params: EnvParams, mirrored: jax.Array | bool = False
+    ) -> Layout:
+        """As in :class:`ContestedLayouts`; instance 0 of the first proposition is the right one.
+
+        Args:
+            key: consumed.
+            first: bool ``[P]``, what is to be reached first.
+            second: bool ``[P]``, what is to be reached after it.
+            params: of the environment.
+            mirrored: bool ``[]``, draw the control instead, on which the nearest instance is the right one: number 0.
+        """
+
+
+class Drawable(Environment):
+    """An environment that can be drawn from above."""
+
+    @abc.abstractmethod
+    def scene(self, layout: Layout) -> Scene:
+        """What there is to see in an unbatched layout (numpy leaves) besides the agent. On the host."""
+
+    @abc.abstractmethod
+    def position(self, state: State) -> jax.Array:
+        """Where the agent is, in the scene's coordinates, ``[2]``, or ``[3]`` with its heading in radians."""

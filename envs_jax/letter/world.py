@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs_jax.base import Box, Discrete, Environment, EnvParams, StepResult, Symmetries
+from envs_jax.base import Box, ContestedLayouts, Discrete, EnvParams, FiniteGraph, StepResult, Symmetric, Symmetries
 from envs_jax.letter.contested import most_contested, myopia_regret
 
 NO_LETTER = -1
@@ -49,7 +49,7 @@ class LetterState:
 
 
 @dataclasses.dataclass(frozen=True)
-class Letter(Environment):
+class Letter(Symmetric, FiniteGraph, ContestedLayouts):
     """The Letter world.
 
     Layout: int8 ``[n, n]``; ``num_cells / num_letters`` cells for each letter, placed uniformly over the cells

@@ -16,7 +16,7 @@ import numpy as np
 from flax import struct
 from scipy import ndimage
 
-from envs_jax.base import Box, Environment, EnvParams, StepResult
+from envs_jax.base import Box, EnvParams, GridMap, StepResult
 
 NO_DISC = -1.0
 """Radius of the entries that pad a proposition with fewer discs than others."""
@@ -82,7 +82,7 @@ class WalkState:
 
 
 @dataclasses.dataclass(frozen=True)
-class Walk(Environment):
+class Walk(GridMap):
     """The Walk world: a square, round regions that may overlap, a point that moves where it is told.
 
     Only the position is observed, so an agent has to learn where the regions are: they are the same in every episode

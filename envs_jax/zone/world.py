@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs_jax.base import Box, Environment, EnvParams, Reflections, StepResult
+from envs_jax.base import Box, ContestedChoice, EnvParams, Reflections, StepResult, Symmetric
 from envs_jax.zone import physics as zone_physics
 from envs_jax.zone.contested import contested_layout
 from envs_jax.zone.layouts import COLOURS, ZONES_EACH, ZoneLayout, new_layout
@@ -50,7 +50,7 @@ class ZoneState:
 
 
 @dataclasses.dataclass(frozen=True)
-class Zone(Environment):
+class Zone(Symmetric, ContestedChoice):
     """The Zone world.
 
     Layout: a `ZoneLayout`, the robot's pose and two zones of each colour. Observation: float32 ``[80]``:
