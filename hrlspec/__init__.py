@@ -1,26 +1,26 @@
-"""Zero-shot reinforcement learning from SPECTRL specifications: language, agent, training, evaluation."""
+"""Zero-shot reinforcement learning from logical specifications: language, agent, training, evaluation."""
 
 from __future__ import annotations
 
 from hrlspec.agent.agent import Agent
+from hrlspec.api import TrainedAgent, evaluate, train
 from hrlspec.config import Config
-from hrlspec.evaluation.episodes import run_episodes, trace_episodes
-from hrlspec.learning.train import Trainer, TrainState
-from hrlspec.spec import compile, parse
-from hrlspec.tasks.rewards import Bonus, RewardMachine, reward_machine
+from hrlspec.learning.train import Trainer
+from hrlspec.presets import preset
+from hrlspec.spec import compile_task, parse
+from hrlspec.tasks.rewards import reward_machine
 from hrlspec.version import __version__
 
 __all__ = [
     "Agent",
-    "Bonus",
     "Config",
-    "RewardMachine",
-    "TrainState",
+    "TrainedAgent",
     "Trainer",
     "__version__",
-    "compile",
+    "compile_task",
+    "evaluate",
     "parse",
+    "preset",
     "reward_machine",
-    "run_episodes",
-    "trace_episodes",
+    "train",
 ]

@@ -1,42 +1,60 @@
-"""Everything a run can be told, as frozen dataclasses; the tuned values live in ``hrlspec/presets``.
+"""Settings that all methods share, as frozen dataclasses that validate themselves where they are made.
 
-All fields are static: they shape the compiled program. What may change inside a run (parameters, counters,
-curriculum level) lives in :class:`hrlspec.learning.train.TrainState`.
+All fields are static: they shape the compiled program. What may change inside a run (parameters, counters, curriculum
+level) lives in :class:`hrlspec.learning.train.TrainState`; what belongs to one method lives with it, in
+``hrlspec/methods``; tuned values live in ``hrlspec/presets``.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+S = TypeVar("S")
+
+
+class ConfigError(ValueError):
+    """A setting that cannot be meant. The message names it, what was found and what was expected."""
+
+
+def setting(default: Any, *, least: float = -math.inf, most: float = math.inf) -> Any:
+    """A field with a default and the range that its value, or each entry of a tuple, must lie in (bounds included)."""
+    return dataclasses.field(default=default, metadata={"range": (least, most)})
+
+
+class Checked:
+    """Base of settings: a value out of its field's range is refused when the settings are made."""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]
+            least, most = field.metadata.get("range", (-math.inf, math.inf))
+            found = getattr(self, field.name)
+            for value in found if isinstance(found, tuple) else (found,):
+                if isinstance(value, int | float) and not least <= value <= most:
+                    bounds = f"at least {least:g}" if most == math.inf else f"a number from {least:g} to {most:g}"
+                    raise ConfigError(f"{type(self).__name__}.{field.name} is {found}, expected {bounds}")
 
 
 @dataclasses.dataclass(frozen=True)
-class NetworkConfig:
-    """Sizes of the networks (paper, "High-level Architecture" and "Low-level Architecture")."""
+class NetworkConfig(Checked):
+    """Sizes of the networks (paper, "Low-level Architecture"); the encoder's are those of the planner's too."""
 
-    latent: int = 64
-    """Width of both encoders' output."""
-    conv_channels: tuple[int, ...] = (16, 32, 64)
+    latent: int = setting(64, least=1)
+    """Width of the encoders' output."""
+    conv_channels: tuple[int, ...] = setting((16, 32, 64), least=1)
     """Channels of the 2x2 convolutions for image observations; none: images are encoded as vectors."""
-    encoder_mlp: tuple[int, ...] = (128, 128)
+    encoder_mlp: tuple[int, ...] = setting((128, 128), least=1)
     """Hidden units of the encoder for vectors."""
-    planner_features: int = 64
-    """F, node features of the planner's GNN."""
-    planner_hidden: int = 128
-    """Hidden units of the planner's transition model and critic."""
-    planner_policy: tuple[int, ...] = (128, 128, 128)
-    """Hidden units of the planner's policy, which is applied to every edge."""
-    planner_rounds: int = 8
-    """Rounds of message passing of the planner, each normalised; look-ahead ends at this depth. 0: one sweep from the
-    leaves to the root, which looks ahead without limit and costs an eighth."""
-    task_features: int = 32
+    task_features: int = setting(32, least=1)
     """Node features of the low level's GNN over the remaining tasks."""
-    task_rounds: int = 8
-    """Rounds of message passing of the low level's GNN; 0 as for ``planner_rounds``."""
-    actor: tuple[int, ...] = (64, 64, 64)
-    critic: tuple[int, ...] = (64, 64)
-    reach_critic: tuple[int, ...] = (64, 64)
+    task_rounds: int = setting(8, least=0)
+    """Rounds of message passing of the low level's GNN. 0: one sweep from the leaves to the root, which looks ahead
+    without limit and costs an eighth."""
+    actor: tuple[int, ...] = setting((64, 64, 64), least=1)
+    critic: tuple[int, ...] = setting((64, 64), least=1)
+    reach_critic: tuple[int, ...] = setting((64, 64), least=1)
     """Hidden units of the critic behind the shield."""
     roles: bool = False
     """Task-conditioned encoding: the low level sees the observation by role (the goal p₊, the forbidden p₋, what comes
@@ -48,162 +66,154 @@ class NetworkConfig:
     """Whether the low level sees the world in one of its turned or reflected forms alone: its goal in one sector, or,
     where vectors are reflected, its own motion forward; in environments that say how, seen by role. What is
     learned in one direction is then known in all."""
-    task_scale: float = 4.0
+    task_scale: float = setting(4.0, least=1e-3, most=1e3)
     """What the low level is told of its sub-task is multiplied by this: a flag beside a hundred features of the latent
-    is hardly heard at first. The embedding of what comes after it is not: as loud, it would drown the sub-task. With
-    ``whole_task`` there is no sub-task, and the embedding is multiplied."""
-    lookahead: int = 2
+    is hardly heard at first. The embedding of what comes after it is not: as loud, it would drown the sub-task. Where
+    the whole task is told there is no sub-task, and the embedding is multiplied."""
+    lookahead: int = setting(2, least=0)
     """How many later sub-tasks have a role of their own."""
-    memory: int = 0
+    memory: int = setting(0, least=0)
     """How many of the sub-tasks completed last the low level remembers: where a reward depends on their order, what the
     rest of the task is worth depends on them."""
-    whole_task: bool = False
-    """Whether the low level is told the whole remaining task, with what each edge forbids, instead of a sub-task: one
-    flat policy and no planner (the baseline LTL2Action). Then ``task_rounds`` and ``memory`` are 0, and roles and
-    advice are off."""
-    child_embeddings: bool = False
-    """Whether the planner's logit of an edge also sees the embedding of the node it leads to."""
-    advice: float = 0.0
-    """Weight of the low level's value of each candidate sub-task in the planner's logits (gradient stopped); the
-    planner learns a correction to it. 0: the planner judges alone, as in the paper."""
-    advised: int = 12
-    """Ways to a leaf that are valued for the advice; edges without one count as the worst of these."""
 
 
 @dataclasses.dataclass(frozen=True)
-class PPOConfig:
+class OptimiserConfig(Checked):
+    """Adam on minibatches, behind a clip of the gradient's global norm."""
+
+    learning_rate: float = setting(1e-3, least=0, most=1e6)
+    final_learning_rate: float = setting(0.0, least=0, most=1e6)
+    """What the learning rate comes to in the end, linearly."""
+    epochs: int = setting(2, least=1)
+    minibatches: int = setting(16, least=1)
+    max_grad_norm: float = setting(0.5, least=1e-9, most=1e9)
+
+
+@dataclasses.dataclass(frozen=True)
+class PPOConfig(Checked):
     """Proximal policy optimisation at one level."""
 
-    learning_rate: float = 1e-3
-    final_learning_rate: float = 0.0
-    epochs: int = 2
-    minibatches: int = 16
-    clip: float = 0.2
-    most_ratio: float = math.exp(10.0)
-    """Largest probability ratio that counts where the advantage is negative; 1.0 + ``clip`` or more."""
-    entropy: float = 0.002
-    final_entropy: float = 0.002
-    entropy_floor: float = 0.0
+    optimiser: OptimiserConfig = OptimiserConfig()
+    clip: float = setting(0.2, least=0, most=1e6)
+    dual_clip: float = setting(math.exp(10.0), least=1, most=1e9)
+    """Largest probability ratio that counts where the advantage is negative (dual clip); 1.0 + ``clip`` or more."""
+    entropy: float = setting(0.002, least=0, most=1e6)
+    final_entropy: float = setting(0.002, least=0, most=1e6)
+    entropy_floor: float = setting(0.0, least=0, most=1e6)
     """Mean entropy (nats) that the policy is kept near or above at first: below it the entropy's weight grows by twice
     what is missing. 0: none, as for Gaussians, whose entropy may be negative."""
-    final_entropy_floor: float = 0.0
-    value_coefficient: float = 0.5
-    expectile: float = 0.5
-    """What the critic learns of the returns: 0.5 their mean, above it an optimistic expectile, which in deterministic
-    worlds approaches the best return within reach."""
-    gae_lambda: float = 0.95
-    relative: float = 0.0
+    final_entropy_floor: float = setting(0.0, least=0, most=1e6)
+    value_coefficient: float = setting(0.5, least=0, most=1e6)
+    gae_lambda: float = setting(0.95, least=0, most=1)
+    advantage_scale: float = setting(0.0, least=0, most=1e6)
     """r: the policy's advantages are divided by r + |V|, in units of the critic, so that tasks that pay little are
     learned like tasks that pay much. 0: as they are."""
-    max_grad_norm: float = 0.5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.dual_clip < 1 + self.clip:
+            raise ConfigError(f"PPOConfig.dual_clip is {self.dual_clip}, expected at least 1 + clip, {1 + self.clip:g}")
 
 
 @dataclasses.dataclass(frozen=True)
-class CurriculumConfig:
+class CurriculumConfig(Checked):
     """Tasks to collect on (paper, "Training Curriculum")."""
 
-    levels: int = 4
+    levels: int = setting(4, least=1)
     """K, the longest sequence."""
-    promotion: float = 0.85
+    promotion: float = setting(0.85, least=0, most=1)
     """Success rate that promotes to the next level."""
-    window: int = 512
+    window: int = setting(512, least=0)
     """Finished episodes of the current level over which it is measured."""
-    earlier: float = 0.2
+    earlier: float = setting(0.2, least=0, most=1)
     """Share of episodes on levels already passed."""
-    tree_share: float = 0.0
+    tree_share: float = setting(0.0, least=0, most=1)
     """Share of random trees, instead of sequences, in each level's tasks."""
-    contested: float = 0.0
-    """Share of episodes in layouts made to teach look-ahead, where nearest-first loses. Only in environments with a
-    ``contested_layout``."""
-    max_branching: int = 3
-    max_avoid: int = 3
-    tasks_per_level: int = 512
+    contested: float = setting(0.0, least=0, most=1)
+    """Share of episodes in layouts made to teach look-ahead, where nearest-first loses; in environments that are
+    `envs_jax.ContestedLayouts`."""
+    max_branching: int = setting(3, least=1)
+    max_avoid: int = setting(3, least=0)
+    tasks_per_level: int = setting(512, least=1)
     """Rows of the bank for each level; the bank is drawn anew between chunks."""
-    max_nodes: int = 16
+    max_nodes: int = setting(16, least=2)
     """N, the padded size of training tasks."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.max_nodes < self.levels + 2:
+            raise ConfigError(
+                f"CurriculumConfig.max_nodes is {self.max_nodes}, expected at least levels + 2, {self.levels + 2}"
+            )
 
 
 @dataclasses.dataclass(frozen=True)
-class RelabelConfig:
+class RelabelConfig(Checked):
     """Experience relabelling into random trees (paper, "Experience Replay")."""
 
-    share: float = 0.5
+    share: float = setting(0.5, least=0, most=1)
     """Share of the environments whose trajectories are trained on a second time, relabelled. 0 switches it off."""
-    planner_policy: bool = True
-    """Whether the planner's policy learns from the copies; its value and transition model always do. In a copy the
-    branch taken was not chosen by the planner, and always succeeded."""
     corrected: bool = True
     """Whether a copied action counts by how likely the policy makes it under the new task, relative to the probability
     that it was drawn with under the old one; a copied choice of the planner relative to 1, for the path was no choice.
     Off, relative to the new task's own probability before the update."""
-    visits: bool = False
-    """Whether every proposition visited counts as a completed sub-task, in hindsight, and not only those assigned."""
-    branch: float = 0.7
+    hindsight: bool = False
+    """Whether every proposition visited counts as a completed sub-task, and not only those assigned."""
+    branch: float = setting(0.7, least=0, most=1)
     """Probability of a random branch at each node of the completed path."""
 
 
 @dataclasses.dataclass(frozen=True)
-class ShieldConfig:
+class ShieldConfig(Checked):
     """Proposition avoidance (paper, "Avoiding Propositions")."""
 
-    mode: Literal["off", "state", "action"] = "state"
-    """``state`` replaces the action wherever a forbidden proposition is near, as in the paper; ``action`` only where
-    the chosen action itself leads to it."""
-    threshold: float = 0.9
+    enabled: bool = True
+    """Whether actions near a forbidden proposition are replaced while collecting."""
+    threshold: float = setting(0.9, least=0, most=1)
     """ν: V(s, g) above it counts as near."""
-    discount: float = 0.85
+    discount: float = setting(0.85, least=0, most=1)
     """Discount of the reach critic: its value is discount^(steps to g - 1)."""
-    learning_rate: float = 1e-3
-    minibatches: int = 8
+    optimiser: OptimiserConfig = OptimiserConfig(final_learning_rate=1e-3, epochs=1, minibatches=8, max_grad_norm=1.0)
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
-    """A whole training run, less its environment."""
+class Config(Checked):
+    """A training run, less its environment, method and rewards."""
 
-    num_envs: int = 128
+    num_envs: int = setting(128, least=1)
     """E, environments stepped side by side."""
-    num_steps: int = 64
+    num_steps: int = setting(64, least=2)
     """T, steps of a rollout."""
-    total_steps: int = 3_000_000
-    discount: float = 0.94
+    total_steps: int = setting(3_000_000, least=1, most=2**40)
+    discount: float = setting(0.94, least=0, most=1)
     """γ, per environment step, at both levels."""
-    max_operator: bool = True
-    """Whether the target at a new sub-task is raised to the planner's value (eq. 6)."""
-    future_embedding: bool = True
-    """Whether the low level sees what remains after its sub-task; off is the ablation Myopic-low."""
-    options: bool = False
-    """Whether sub-tasks are options that know nothing of each other, chosen by value iteration over what they were
-    measured to take (the baseline Option), instead of by the planner."""
-    unfinished: bool = False
-    """Whether sub-tasks that were assigned but not completed train the planner."""
-    transe: float = 0.01
-    """λ, the weight of the TransE loss."""
-    transe_margin: float = 1.0
-    """ξ, the margin of the TransE loss."""
-    noise_correlation: float = 0.0
+    noise_correlation: float = setting(0.0, least=0, most=0.999)
     """Correlation of the noise of successive steps while collecting, for continuous actions: coloured noise explores
     farther than white noise, whose steps cancel out."""
-    final_noise_correlation: float = 0.0
+    final_noise_correlation: float = setting(0.0, least=0, most=0.999)
     """What it comes to in the end, linearly. A policy trained with coloured noise to the end leaves it to the noise to
     get it out of where it hesitates, and stands still without."""
-    steps_per_slot: int = 5
+    steps_per_slot: int = setting(5, least=1)
     """A rollout tells T divided by this many episodes of an environment apart, two at least."""
-    planner_share: int = 16
-    """The planner trains on at most E·T divided by this many decisions per iteration."""
-    group: int = 32
-    """Environments the planner decides for at a time."""
+    group: int = setting(32, least=1)
+    """Environments the high level decides for at a time."""
     low: PPOConfig = PPOConfig()
-    high: PPOConfig = PPOConfig(learning_rate=2e-3, epochs=2, minibatches=8, entropy=0.005, final_entropy=0.005)
     network: NetworkConfig = NetworkConfig()
     curriculum: CurriculumConfig = CurriculumConfig()
     relabel: RelabelConfig = RelabelConfig()
     shield: ShieldConfig = ShieldConfig()
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        rows = self.num_envs + self.num_copies
+        check_divides("Config.low.optimiser.minibatches", self.low.optimiser, rows, "environments and copies")
+        if self.shield.enabled:
+            check_divides("Config.shield.optimiser.minibatches", self.shield.optimiser, self.num_envs, "environments")
+
     @property
-    def plans(self) -> bool:
-        """Whether the planner's networks choose the sub-tasks."""
-        return not (self.options or self.network.whole_task)
+    def num_copies(self) -> int:
+        """Environments whose rollouts are relabelled in an iteration."""
+        return round(self.relabel.share * self.num_envs)
 
     @property
     def steps_per_iteration(self) -> int:
@@ -219,3 +229,28 @@ class Config:
     def num_iterations(self) -> int:
         """Iterations that make up ``total_steps``, rounded up."""
         return -(-self.total_steps // self.steps_per_iteration)
+
+
+def evolve(settings: S, changes: Mapping[str, Any]) -> S:
+    """A copy of settings with changes, by dotted names, checked once all of them are made.
+
+    ``evolve(config, {"num_envs": 64, "low.optimiser.learning_rate": 1e-3})``.
+    """
+    nested: dict[str, dict[str, Any]] = {}
+    for name, value in changes.items():
+        first, _, rest = name.partition(".")
+        nested.setdefault(first, {})[rest] = value
+    values = {
+        name: inner[""] if "" in inner else evolve(getattr(settings, name), inner) for name, inner in nested.items()
+    }
+    return dataclasses.replace(settings, **values)  # type: ignore[type-var]
+
+
+def check_divides(name: str, optimiser: OptimiserConfig, rows: int, what: str) -> None:
+    """Refuses minibatches that do not share their rows evenly.
+
+    Raises:
+        ConfigError: naming the setting, the rows and what they are.
+    """
+    if rows < optimiser.minibatches or rows % optimiser.minibatches:
+        raise ConfigError(f"{name} is {optimiser.minibatches}, expected a divisor of {rows}, the number of {what}")

@@ -15,6 +15,8 @@ import numpy as np
 
 from envs_jax import Box, Discrete
 
+MASKED = -1e9
+"""Logit of what cannot be chosen."""
 LEAST_LOG_STD, MOST_LOG_STD = -1.5, 1.0
 MOST_MEAN = 1.5
 """Bounds of the moments, in units of half the box's width. Experience that is relabelled meets a policy which would

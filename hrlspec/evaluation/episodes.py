@@ -14,15 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from hrlspec.agent.agent import Agent, Params
-from hrlspec.agent.interaction import act, decide, start, transition
+from envs_jax.base import Layout, State
+from hrlspec.agent.agent import Agent
+from hrlspec.agent.interaction import act, assign, start, transition
+from hrlspec.agent.low_level import Params
 from hrlspec.spec import TaskTree
 from hrlspec.tasks.rewards import RewardMachine
 
 
 @struct.dataclass
 class Episodes:
-    """What came of B episodes.
+    """What came of B episodes: JAX arrays in jitted code, numpy arrays outside.
 
     Attributes:
         success: bool ``[B]``, the task was satisfied within the horizon.
@@ -31,15 +33,15 @@ class Episodes:
         returns: float32 ``[B]``, undiscounted sum of rewards.
     """
 
-    success: Any
-    violated: Any
-    steps: Any
-    returns: Any
+    success: Any  # bool [B]
+    violated: Any  # bool [B]
+    steps: Any  # int32 [B]
+    returns: Any  # float32 [B]
 
 
 @struct.dataclass
 class Trace:
-    """The way there, leading axes ``[H, B]``; entry t is the state before step t, meaningful while ``running``.
+    """What happened, leading axes ``[H, B]``; entry t is the state before step t, meaningful while ``running``.
 
     Attributes:
         env_state: states of the environment.
@@ -48,10 +50,10 @@ class Trace:
         running: bool.
     """
 
-    env_state: Any
-    node: Any
-    assigned: Any
-    running: Any
+    env_state: State
+    node: Any  # int32 [H, B]
+    assigned: Any  # int32 [H, B]
+    running: Any  # bool [H, B]
 
 
 def run_episodes(
@@ -60,7 +62,7 @@ def run_episodes(
     params: Params,
     machine: RewardMachine,
     trees: TaskTree,
-    layouts: Any,
+    layouts: Layout,
     *,
     greedy: bool = False,
     shield: bool = False,
@@ -100,12 +102,12 @@ def trace_episodes(
     params: Params,
     machine: RewardMachine,
     trees: TaskTree,
-    layouts: Any,
+    layouts: Layout,
     *,
     greedy: bool = False,
     shield: bool = False,
 ) -> tuple[Episodes, Trace]:
-    """As :func:`run_episodes`, for a few episodes, with the states on the way."""
+    """As :func:`run_episodes`, for a few episodes, with the states in between."""
     return jax.tree.map(np.asarray, _run(key, agent, params, machine, trees, layouts, greedy, shield, True))
 
 
@@ -116,15 +118,15 @@ def _run(
     params: Params,
     machine: RewardMachine,
     trees: TaskTree,
-    layouts: Any,
+    layouts: Layout,
     greedy: bool,
     shield: bool,
     traced: bool,
 ) -> tuple[Episodes, Trace | None]:
     num_episodes, num_nodes = trees.parent.shape
     rows = jnp.arange(num_episodes, dtype=jnp.int32)
-    book = agent.open_book(params, trees)
-    worker = start(agent, machine, layouts, rows, jax.vmap(jax.random.fold_in, (None, 0))(key, rows), book)
+    env, book = agent.env, agent.low.open_book(params, trees)
+    worker = start(jax.vmap(jax.random.fold_in, (None, 0))(key, rows), env, machine, book, layouts, rows)
     noise_scale = 0.0 if greedy else 1.0
     zeros = jnp.zeros(num_episodes)
     outcome = Episodes(success=zeros > 0, violated=zeros > 0, steps=zeros.astype(jnp.int32), returns=zeros)
@@ -134,11 +136,11 @@ def _run(
         step_key, plan_key, act_key = jax.random.split(jax.random.fold_in(key, num_episodes + time), 3)
         worker = dataclasses.replace(worker, awaiting=worker.awaiting & running)
         noise = noise_scale * jax.random.gumbel(plan_key, (num_episodes, num_nodes))
-        worker, _ = decide(agent, params, book, worker, noise)
-        noise = noise_scale * agent.actions.noise(act_key, (num_episodes,))
-        action, *_ = act(agent, params, book, worker, noise, shield=shield)
-        seen = Trace(worker.env_state, worker.task_state.node, worker.assigned, running)
-        worker, result = transition(agent, machine, book, worker, action, jax.random.split(step_key, num_episodes))
+        worker = assign(agent, params, book, worker, noise)
+        noise = noise_scale * agent.low.actions.noise(act_key, (num_episodes,))
+        action = act(agent, params, book, worker, noise, shield=shield).action
+        seen = Trace(worker.env_state, worker.task_state.node, worker.decision.edge, running)
+        worker, result = transition(jax.random.split(step_key, num_episodes), env, machine, book, worker, action)
         outcome = Episodes(
             success=outcome.success | (running & result.satisfied),
             violated=outcome.violated | (running & result.terminated & ~result.satisfied),
@@ -150,6 +152,6 @@ def _run(
 
     carry = (worker, outcome, jnp.ones(num_episodes, bool), jnp.int32(0))
     if traced:
-        carry, trace = jax.lax.scan(lambda c, _: step(c), carry, length=agent.env.horizon)
+        carry, trace = jax.lax.scan(lambda c, _: step(c), carry, length=env.horizon)
         return carry[1], trace
     return jax.lax.while_loop(lambda c: c[2].any(), lambda c: step(c)[0], carry)[1], None

@@ -75,7 +75,7 @@ def suite_from_text(name: str, text: str, propositions: Sequence[str], *, max_no
         if not formula:
             continue
         try:
-            trees.append(spec.compile(parse(formula), propositions, max_nodes))
+            trees.append(spec.compile_task(parse(formula), propositions, max_nodes))
         except SpecError as error:
             column = None if error.column is None else error.column + line.index(formula)
             raise SpecError(error.message, number, column or 1) from None

@@ -1,16 +1,19 @@
-"""Proximal policy optimisation: losses and one guarded gradient step (Schulman et al., 2017)."""
+"""Proximal policy optimisation: its loss for both levels (Schulman et al., 2017).
+
+Axes: **B** samples.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 
+from hrlspec.agent.experience import Credit, LowBatch
+from hrlspec.agent.low_level import LowLevel
 from hrlspec.config import PPOConfig
+from hrlspec.learning.optimiser import Metrics, annealed
 
 
 def masked_mean(x: jax.Array, mask: jax.Array) -> jax.Array:
@@ -26,9 +29,10 @@ def normalise(advantage: jax.Array, mask: jax.Array) -> jax.Array:
     return (advantage - mean) / jnp.sqrt(variance + 1e-8)
 
 
-def relative(advantage: jax.Array, value: jax.Array, settings: PPOConfig) -> jax.Array:
+def scaled(advantage: jax.Array, value: jax.Array, settings: PPOConfig) -> jax.Array:
     """Advantages per unit of what was expected: a scale that depends on the state alone, so what is best stays so."""
-    return advantage / (settings.relative + jnp.abs(value)) if settings.relative else advantage
+    scale = settings.advantage_scale
+    return advantage / (scale + jnp.abs(value)) if scale else advantage
 
 
 def policy_loss(
@@ -38,62 +42,87 @@ def policy_loss(
 
     That is the log-probability with which a sample was drawn; for relabelled ones see `RelabelConfig.corrected`.
 
-    Where the advantage is negative the plain surrogate has no bound. With ``most_ratio`` it has (Ye et al., 2020, "dual
-    clip"): what has become so much likelier during the update counts no more.
+    Where the advantage is negative the plain surrogate has no bound. With ``dual_clip`` it has (Ye et al., 2020): what
+    has become so much likelier during the update counts no more.
     """
     # Far outside the clip range only the sign matters; the bounds keep exp from overflowing.
-    ratio = jnp.exp(jnp.clip(jnp.where(mask, log_prob - old, 0.0), -10.0, math.log(settings.most_ratio)))
+    ratio = jnp.exp(jnp.clip(jnp.where(mask, log_prob - old, 0.0), -10.0, math.log(settings.dual_clip)))
     surrogate = jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - settings.clip, 1 + settings.clip) * advantage)
     return -masked_mean(surrogate, mask)
 
 
-def value_loss(value: jax.Array, target: jax.Array, mask: jax.Array, expectile: float) -> jax.Array:
-    """Squared error, errors below the target weighted by 2τ and those above by 2(1 − τ); τ = 0.5 is the plain one."""
-    error = target - value
-    weight = 2.0 * jnp.where(error > 0, expectile, 1.0 - expectile)
-    return masked_mean(weight * error**2, mask)
+def value_loss(value: jax.Array, target: jax.Array, mask: jax.Array) -> jax.Array:
+    """Mean squared error."""
+    return masked_mean((target - value) ** 2, mask)
 
 
-def optimiser(max_grad_norm: float) -> optax.GradientTransformation:
-    """Adam behind a global-norm clip, without a learning rate: :func:`gradient_step` applies the annealed one.
-
-    All parameters form one vector: a handful of operations to compile instead of as many for each layer.
-    """
-    return optax.flatten(optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.scale_by_adam(eps=1e-5)))
-
-
-def annealed(first: float, last: float, progress: jax.Array) -> jax.Array:
-    """Linear from ``first`` to ``last`` as ``progress`` goes from 0 to 1."""
-    return first + (last - first) * jnp.clip(progress, 0.0, 1.0)
-
-
-def gradient_step(
-    loss: Callable[[Any], tuple[jax.Array, dict[str, jax.Array]]],
-    params: Any,
-    optimiser_state: optax.OptState,
-    transform: optax.GradientTransformation,
-    learning_rate: jax.Array,
-) -> tuple[Any, optax.OptState, dict[str, jax.Array]]:
-    """One step; a non-finite loss or gradient leaves everything as it was and is counted in ``skipped``."""
-    (value, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(params)
-    norm = optax.tree.norm(gradient)
-    finite = jnp.isfinite(norm) & jnp.isfinite(value)
-    updates, new_state = transform.update(gradient, optimiser_state, params)
-    stepped = jax.tree.map(lambda p, u: p - learning_rate * u, params, updates)
-    params, optimiser_state = jax.tree.map(
-        lambda new, old: jnp.where(finite, new, old), (stepped, new_state), (params, optimiser_state)
-    )
-    return params, optimiser_state, {**metrics, "grad_norm": norm, "skipped": 1.0 - finite}
-
-
-def entropy_loss(randomness: jax.Array, settings: PPOConfig, progress: jax.Array) -> jax.Array:
-    """Minus the weighted mean entropy ``randomness``, and the square of what it lacks of the floor.
+def entropy_loss(entropy: jax.Array, settings: PPOConfig, progress: jax.Array) -> jax.Array:
+    """Minus the weighted mean entropy, and the square of what it lacks of the floor.
 
     Near the optimum normalised advantages are mostly noise, which drives a policy to certainty; what keeps it from
     there must grow as it gets near.
     """
     weight = annealed(settings.entropy, settings.final_entropy, progress)
     if not settings.entropy_floor:
-        return -weight * randomness
+        return -weight * entropy
     floor = annealed(settings.entropy_floor, settings.final_entropy_floor, progress)
-    return jnp.maximum(floor - randomness, 0.0) ** 2 - weight * randomness
+    return jnp.maximum(floor - entropy, 0.0) ** 2 - weight * entropy
+
+
+def loss(
+    log_prob: jax.Array,
+    old: jax.Array,
+    value: jax.Array,
+    entropy: jax.Array,
+    credit: Credit,
+    settings: PPOConfig,
+    progress: jax.Array,
+) -> tuple[jax.Array, Metrics]:
+    """The loss of an actor and its critic.
+
+    Args:
+        log_prob: float32 ``[B]``, of the samples under the policy as it is.
+        old: float32 ``[B]``, what the ratio is taken to.
+        value: float32 ``[B]``, of the critic.
+        entropy: float32 ``[B]``, of the policy.
+        credit: leading axis B; advantages are normalised over the samples that the policy learns from.
+        settings: weights and clips.
+        progress: float32 ``[]``, share of the training that is done.
+
+    Returns:
+        The loss ``[]`` and its parts.
+    """
+    advantage = normalise(credit.advantage, credit.learns)
+    policy = policy_loss(log_prob, old, advantage, credit.learns, settings)
+    critic = value_loss(value, credit.target, credit.valid)
+    entropy = masked_mean(entropy, credit.learns)
+    total = policy + settings.value_coefficient * critic + entropy_loss(entropy, settings, progress)
+    return total, {"policy_loss": policy, "value_loss": critic, "entropy": entropy}
+
+
+def low_level_loss(
+    low: LowLevel, params: jax.Array, batch: LowBatch, settings: PPOConfig, progress: jax.Array
+) -> tuple[jax.Array, Metrics]:
+    """Loss of the low level on a minibatch ``[V, T]``; steps the shield replaced count for the value alone.
+
+    Args:
+        low: the networks.
+        params: their parameters, ``params["low"]``.
+        batch: samples.
+        settings: weights and clips.
+        progress: float32 ``[]``, share of the training that is done.
+    """
+    own = {"low": params}
+    told = jax.vmap(jax.vmap(low.instruct, in_axes=(None, 0)), in_axes=(None, 0))(own, batch.trees)
+    row = jnp.arange(batch.slot.shape[0])[:, None]
+    now = low.told_now(own, told, (row, batch.slot), batch.edge, batch.feasible, batch.ahead)
+    view, told, decision, credit = jax.tree.map(flat, (batch.view, now, batch.decision, batch.credit))
+    outputs, value = jax.vmap(low.control, in_axes=(None, 0, 0))(own, view, told)
+    log_prob = jax.vmap(low.actions.log_prob)(outputs, decision.action)
+    entropy = jax.vmap(low.actions.entropy)(outputs)
+    return loss(log_prob, decision.log_prob, value, entropy, credit, settings, progress)
+
+
+def flat(x: jax.Array) -> jax.Array:
+    """Merges the two leading axes (zero-sized arrays too)."""
+    return x.reshape((x.shape[0] * x.shape[1], *x.shape[2:]))

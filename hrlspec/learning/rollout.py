@@ -7,57 +7,29 @@ Axes: **T** time steps, **E** environments, **S** layouts of an environment's po
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from hrlspec.agent.agent import Agent, Params, TaskBook, View
-from hrlspec.agent.interaction import Decision, Worker, act, plan_where, restart_where, transition
+from envs_jax import ContestedLayouts
+from envs_jax.base import Layout
+from hrlspec.agent.agent import Agent
+from hrlspec.agent.experience import Bootstrap, HighDecision, Step, View
+from hrlspec.agent.interaction import Worker, act, decide, start, transition, where
+from hrlspec.agent.low_level import Params, TaskBook
 from hrlspec.spec import TaskTree
 from hrlspec.tasks import curriculum
 from hrlspec.tasks.rewards import RewardMachine
 
 
 @struct.dataclass
-class Trajectory:
-    """What was collected; every field has leading axes ``[T, E]``. "Before" and "after" are relative to the step."""
-
-    view: View  # observation before
-    task: jax.Array  # int32, row of the task book
-    episode: jax.Array  # int32, which episode of this rollout, 0-based
-    node: jax.Array  # int32, task node before
-    blocked: jax.Array  # bool [..., N], blocked edges before
-    assigned: jax.Array  # int32, edge pursued
-    ahead: jax.Array  # float32 [..., D, P], what the planner meant to reach after it
-    decided: jax.Array  # bool, the planner decided before
-    since: jax.Array  # int32, steps since the edge was assigned
-    plan_log_prob: jax.Array  # float32, where decided
-    plan_value: jax.Array  # float32, where decided
-    advice: jax.Array  # float32 [..., N], where decided
-    action: jax.Array  # int32, or float32 [..., A]
-    log_prob: jax.Array  # float32
-    value: jax.Array  # float32
-    shielded: jax.Array  # bool, the shield replaced the action
-    labels: jax.Array  # bool [..., P], after
-    edge: jax.Array  # int32, node whose edge was taken, or the node before when none was
-    edge_taken: jax.Array  # bool
-    reward: jax.Array  # float32
-    terminated: jax.Array  # bool
-    truncated: jax.Array  # bool
-    bootstrap: jax.Array  # float32, low level's value after; where truncated and at T - 1
-    plan_bootstrap: jax.Array  # float32, planner's value after; likewise
-    reach_value: jax.Array  # float32 [..., P], reach critic's value after, before any reset; empty without a shield
-    satisfied: jax.Array  # bool
-    level: jax.Array  # int32, curriculum level of the task
-
-
-@struct.dataclass
 class Pool:
     """What the next episodes start with, leading axes ``[E, S]``; environment e takes its S entries in turn."""
 
-    layout: Any
+    layout: Layout
     task: jax.Array  # int32, row of the task book
     level: jax.Array  # int32, its curriculum level
 
@@ -67,10 +39,36 @@ class Collector:
     """What goes on from one rollout to the next; leading axis E."""
 
     worker: Worker
-    decision: Decision  # made for the state that the worker is in
     level: jax.Array  # int32 [E], curriculum level of each task
     started: jax.Array  # int32 [E], episodes started so far, for the pool
     since: jax.Array  # int32 [E], steps since the sub-task in force was assigned
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """What stays the same throughout a rollout.
+
+    Attributes:
+        agent: both levels.
+        params: their parameters.
+        machine: the rewards.
+        book: tasks: the E running ones, then the bank, level by level.
+        pool: what the next episodes start with.
+    """
+
+    agent: Agent
+    params: Params
+    machine: RewardMachine
+    book: TaskBook
+    pool: Pool
+
+
+class _Chance(NamedTuple):
+    """Randomness of one step, leading axis E; of a rollout, leading axes ``[T, E]``."""
+
+    high: jax.Array  # float32 [E, N]
+    low: jax.Array  # float32 [E, ...]
+    keys: jax.Array  # [E]
 
 
 def fill_pool(key: jax.Array, agent: Agent, book: TaskBook, level: jax.Array, size: int) -> Pool:
@@ -78,12 +76,10 @@ def fill_pool(key: jax.Array, agent: Agent, book: TaskBook, level: jax.Array, si
 
     A share ``contested`` of the layouts is contested, in environments that know how to draw such layouts.
     """
-    config = agent.config.curriculum
-    env: Any = agent.env  # to draw contested layouts is no duty of environments
-    selective = config.contested > 0 and hasattr(env, "contested_layout")
+    config, env = agent.config.curriculum, agent.env
 
-    def draw(key: jax.Array, task: jax.Array, wanted: jax.Array) -> Any:
-        if not selective:
+    def draw(key: jax.Array, task: jax.Array, wanted: jax.Array) -> Layout:
+        if not config.contested or not isinstance(env, ContestedLayouts):
             return env.sample_layout(key, env.default_params)
         first, second = opening(jax.tree.map(lambda x: x[task], book.tree))
         return env.contested_layout(key, first & wanted, second & wanted, env.default_params)
@@ -107,107 +103,110 @@ def opening(tree: TaskTree) -> tuple[jax.Array, jax.Array]:
 
 
 def collect(
-    key: jax.Array,
-    agent: Agent,
-    params: Params,
-    machine: RewardMachine,
-    book: TaskBook,
-    collector: Collector,
-    pool: Pool,
-    correlation: jax.Array | float,
-) -> tuple[Collector, Trajectory]:
-    """Rolls out E×T steps. Workers come and go with a sub-task assigned: decisions are made at the end of a step.
+    key: jax.Array, setting: Setting, collector: Collector, correlation: jax.Array | float
+) -> tuple[Collector, Step]:
+    """Rolls out E×T steps. Workers come and go with a sub-task in force: decisions are made at the end of a step.
 
     Args:
         key: consumed; every environment's randomness derives from its index.
-        agent: the networks.
-        params: their parameters.
-        machine: the rewards.
-        book: tasks: the E running ones, then the bank, level by level.
+        setting: agent, parameters, rewards and tasks.
         collector: where the last rollout stopped.
-        pool: what the next episodes start with.
         correlation: of the noise of successive steps, for continuous actions, float32 ``[]``.
+
+    Returns:
+        Where this one stopped, and its steps, leading axes ``[T, E]``.
     """
-    config = agent.config
-    num_envs, num_nodes = config.num_envs, book.tree.parent.shape[-1]
-    pool_size = pool.task.shape[1]
-    envs = jnp.arange(num_envs)
-
-    def randomness(env: jax.Array) -> tuple[jax.Array, ...]:
-        keys = jax.random.split(jax.random.fold_in(key, env), 3)
-        return (
-            jax.random.gumbel(keys[0], (config.num_steps, num_nodes)),
-            agent.actions.noise_sequence(keys[1], config.num_steps, correlation),
-            jax.random.split(keys[2], config.num_steps),
-        )
-
-    def reach_value(params: Params, view: View) -> jax.Array:
-        if config.shield.mode == "off":
-            return jnp.zeros((num_envs, 0))
-        return jax.vmap(agent.reach_values, in_axes=(None, 0))(params, view).max(-1)
-
-    def step(collector: Collector, inputs: tuple[jax.Array, ...]) -> tuple[Collector, Trajectory]:
-        plan_noise, noise, keys, last = inputs
-        before, decision = collector.worker, collector.decision
-        action, log_prob, value, shielded = act(agent, params, book, before, noise, shield=config.shield.mode != "off")
-        step_keys, reset_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
-        worker, outcome = transition(agent, machine, book, before, action, step_keys)
-        ended = outcome.terminated | outcome.truncated
-        started = collector.started + ended
-        fresh = jax.tree.map(lambda x: x[envs, started % pool_size], pool)
-        after = restart_where(agent, machine, worker, ended, fresh.layout, fresh.task, reset_keys, book)
-        # One pass of the planner serves the decisions that are due, the values of truncated states, and in the end
-        # those of all states reached: compiled once.
-        both = jax.tree.map(lambda *x: jnp.concatenate(x), after, worker)
-        needed = jnp.concatenate([after.awaiting | last, outcome.truncated])
-        plan_noise = jnp.concatenate([plan_noise, jnp.zeros_like(plan_noise)])
-        choice, ahead, planned = plan_where(agent, params, book, both, needed, plan_noise)
-        choice = jnp.where(after.awaiting, choice[:num_envs], after.assigned)
-        ahead = jnp.where(after.awaiting[:, None, None], ahead[:num_envs], after.ahead)
-        bootstrap = jnp.where(outcome.truncated, planned.value[num_envs:], planned.value[:num_envs])
-        record = Trajectory(
-            view=before.view,
-            task=before.task,
-            episode=collector.started,
-            node=before.task_state.node,
-            blocked=before.task_state.blocked,
-            assigned=before.assigned,
-            ahead=before.ahead,
-            decided=decision.made,
-            since=collector.since,
-            plan_log_prob=decision.log_prob,
-            plan_value=decision.value,
-            advice=decision.advice,
-            action=action,
-            log_prob=log_prob,
-            value=value,
-            shielded=shielded,
-            labels=outcome.labels,
-            edge=worker.task_state.node,
-            edge_taken=outcome.edge_taken,
-            reward=outcome.reward,
-            terminated=outcome.terminated,
-            truncated=outcome.truncated,
-            bootstrap=bootstrap,
-            plan_bootstrap=bootstrap,
-            reach_value=reach_value(params, worker.view),
-            satisfied=outcome.satisfied,
-            level=collector.level,
-        )
-        collector = Collector(
-            worker=dataclasses.replace(after, assigned=choice, ahead=ahead, awaiting=jnp.zeros(num_envs, bool)),
-            decision=dataclasses.replace(jax.tree.map(lambda x: x[:num_envs], planned), made=after.awaiting),
-            level=jnp.where(ended, fresh.level, collector.level),
-            started=started,
-            since=jnp.where(after.awaiting, 0, collector.since + 1),
-        )
-        return collector, record
-
-    last = jnp.arange(config.num_steps) == config.num_steps - 1
-    inputs = (*jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), jax.vmap(randomness)(envs)), last)
+    agent, params, book = setting.agent, setting.params, setting.book
+    num_envs, num_steps = agent.config.num_envs, agent.config.num_steps
+    chance = _draw(key, agent, book.tree.num_nodes, correlation)
+    last = jnp.arange(num_steps) == num_steps - 1
     collector = dataclasses.replace(collector, started=jnp.zeros(num_envs, jnp.int32))
-    collector, trajectory = jax.lax.scan(step, collector, inputs)
-    worker = collector.worker
-    low = act(agent, params, book, worker, jnp.zeros((num_envs, *agent.actions.noise_shape)), shield=False)[2]
-    low = jnp.where(trajectory.truncated[-1], trajectory.bootstrap[-1], low)
-    return collector, dataclasses.replace(trajectory, bootstrap=trajectory.bootstrap.at[-1].set(low))
+    collector, steps = jax.lax.scan(functools.partial(_step, setting), collector, (chance, last))
+    silence = jnp.zeros((num_envs, *agent.low.actions.noise_shape))
+    value = act(agent, params, book, collector.worker, silence, shield=False).value
+    value = jnp.where(steps.outcome.truncated[-1], steps.bootstrap.low[-1], value)
+    bootstrap = dataclasses.replace(steps.bootstrap, low=steps.bootstrap.low.at[-1].set(value))
+    return collector, dataclasses.replace(steps, bootstrap=bootstrap)
+
+
+def _draw(key: jax.Array, agent: Agent, num_nodes: int, correlation: jax.Array | float) -> _Chance:
+    """The randomness of a rollout, leading axes ``[T, E]``."""
+    num_envs, num_steps = agent.config.num_envs, agent.config.num_steps
+
+    def one(env: jax.Array) -> _Chance:
+        keys = jax.random.split(jax.random.fold_in(key, env), 3)
+        return _Chance(
+            jax.random.gumbel(keys[0], (num_steps, num_nodes)),
+            agent.low.actions.noise_sequence(keys[1], num_steps, correlation),
+            jax.random.split(keys[2], num_steps),
+        )
+
+    chance: _Chance = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), jax.vmap(one)(jnp.arange(num_envs)))
+    return chance
+
+
+def _step(setting: Setting, collector: Collector, inputs: tuple[_Chance, jax.Array]) -> tuple[Collector, Step]:
+    """One step of all environments: act, step the worlds, restart what ended, decide what is due."""
+    agent, params, book, pool = setting.agent, setting.params, setting.book, setting.pool
+    chance, last = inputs
+    before, num_envs = collector.worker, collector.level.shape[0]
+    shield = agent.config.shield.enabled
+    low = act(agent, params, book, before, chance.low, shield=shield)
+    step_keys, reset_keys = jax.vmap(jax.random.split, out_axes=1)(chance.keys)
+    worker, outcome = transition(step_keys, agent.env, setting.machine, book, before, low.action)
+    ended = outcome.terminated | outcome.truncated
+    started = collector.started + ended
+    fresh = jax.tree.map(lambda x: x[jnp.arange(num_envs), started % pool.task.shape[1]], pool)
+    begun = start(reset_keys, agent.env, setting.machine, book, fresh.layout, fresh.task)
+    after = where(ended, begun, worker)
+    decision, bootstrap = _plan(setting, after, worker, outcome.truncated, last, chance.high)
+    record = Step(
+        view=before.view,
+        task=before.task,
+        level=collector.level,
+        episode=collector.started,
+        since=collector.since,
+        state=before.task_state,
+        high=before.decision,
+        low=low,
+        outcome=outcome,
+        bootstrap=Bootstrap(low=bootstrap, high=bootstrap),
+        reach_value=_reach_values(agent, params, worker.view) if shield else jnp.zeros((num_envs, 0)),
+    )
+    collector = Collector(
+        worker=dataclasses.replace(after, decision=decision, awaiting=jnp.zeros(num_envs, bool)),
+        level=jnp.where(ended, fresh.level, collector.level),
+        started=started,
+        since=jnp.where(after.awaiting, 0, collector.since + 1),
+    )
+    return collector, record
+
+
+def _plan(
+    setting: Setting, after: Worker, ended: Worker, truncated: jax.Array, last: jax.Array, noise: jax.Array
+) -> tuple[HighDecision, jax.Array]:
+    """Decisions for the next step, and V^h of the states that this one led to, where they are needed.
+
+    One pass of the high level serves the decisions that are due, the values of truncated states, and in the end those
+    of all states reached: compiled once.
+    """
+    num_envs, due = truncated.shape[0], after.awaiting
+    both = jax.tree.map(lambda *x: jnp.concatenate(x), after, ended)
+    needed = jnp.concatenate([due | last, truncated])
+    noise = jnp.concatenate([noise, jnp.zeros_like(noise)])
+    planned = decide(setting.agent, setting.params, setting.book, both, needed, noise)
+    bootstrap = jnp.where(truncated, planned.value[num_envs:], planned.value[:num_envs])
+    planned = jax.tree.map(lambda x: x[:num_envs], planned)
+    in_force = after.decision
+    decision = dataclasses.replace(
+        planned,
+        made=due,
+        edge=jnp.where(due, planned.edge, in_force.edge),
+        ahead=jnp.where(due[:, None, None], planned.ahead, in_force.ahead),
+    )
+    return decision, bootstrap
+
+
+def _reach_values(agent: Agent, params: Params, view: View) -> jax.Array:
+    """max_a Q(s, g, a) of each environment and proposition, float32 ``[E, P]``."""
+    return jax.vmap(agent.low.reach_values, in_axes=(None, 0))(params, view).max(-1)

@@ -1,4 +1,4 @@
-"""Targets of both levels: λ-returns with the max operator, and SMDP advantages between decisions.
+"""Targets of both levels: λ-returns with the max operator, and SMDP advantages between the high level's decisions.
 
 Axes: **T** time steps, **E** environments (any trailing axes).
 """
@@ -16,7 +16,7 @@ def low_level_targets(
     value: jax.Array,
     bootstrap: jax.Array,
     decided: jax.Array,
-    planner_value: jax.Array,
+    high_value: jax.Array,
     *,
     discount: float,
     gae_lambda: float,
@@ -24,7 +24,7 @@ def low_level_targets(
 ) -> jax.Array:
     """λ-returns ``G_t = r_t + γ[(1−λ)V_{t+1} + λG_{t+1}]`` with the max operator (eq. 6).
 
-    At a state where a new sub-task starts, G is raised to the planner's value of the remaining task:
+    At a state where a new sub-task starts, G is raised to the high level's value of what remains:
     ``G := max(G, V^h)``. Values bootstrap on truncation and at the end of the rollout, never on termination.
 
     Args:
@@ -34,7 +34,7 @@ def low_level_targets(
         value: float32 ``[T, E]``, V^l of the state at t.
         bootstrap: float32 ``[T, E]``, value of the state after t; read where truncated and at T - 1.
         decided: bool ``[T, E]``, a new sub-task starts at t.
-        planner_value: float32 ``[T, E]``, V^h of the state at t; read where ``decided``.
+        high_value: float32 ``[T, E]``, V^h of the state at t; read where ``decided``.
         discount: γ.
         gae_lambda: λ.
         max_operator: whether to apply it.
@@ -49,19 +49,19 @@ def low_level_targets(
         carry: tuple[jax.Array, jax.Array], inputs: tuple[jax.Array, ...]
     ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
         next_value, next_return = carry
-        reward, terminated, cut, value, bootstrap, raised, planner_value = inputs
+        reward, terminated, cut, value, bootstrap, raised, high_value = inputs
         ahead = (1 - gae_lambda) * next_value + gae_lambda * next_return
         ahead = jnp.where(cut, bootstrap, ahead)
         target = reward + discount * jnp.where(terminated, 0.0, ahead)
-        passed_on = jnp.where(raised, jnp.maximum(target, planner_value), target)
+        passed_on = jnp.where(raised, jnp.maximum(target, high_value), target)
         return (value, passed_on), target
 
     zero = jnp.zeros_like(reward[0])
-    inputs = (reward, terminated, cut, value, bootstrap, raised, planner_value)
+    inputs = (reward, terminated, cut, value, bootstrap, raised, high_value)
     return jax.lax.scan(backward, (zero, zero), inputs, reverse=True)[1]
 
 
-def planner_targets(
+def high_level_targets(
     reward: jax.Array,
     terminated: jax.Array,
     truncated: jax.Array,
@@ -72,11 +72,11 @@ def planner_targets(
     discount: float,
     gae_lambda: float | jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """SMDP generalised advantages of the planner's decisions.
+    """SMDP generalised advantages of the high level's decisions.
 
     For a decision at t whose successor is at t' the reward is ``R = Σ γ^{τ−t} r_τ`` and the bootstrap
     ``γ^{t'−t} V(s_{t'})``; advantages follow ``A_t = δ_t + γ^{t'−t} λ A_{t'}``. A decision still open at the end of
-    the rollout is bootstrapped with the planner's value of the state reached, and goes on in the next one.
+    the rollout is bootstrapped with V^h of the state reached, and goes on in the next one.
 
     Args:
         reward, terminated, truncated: as for :func:`low_level_targets`.

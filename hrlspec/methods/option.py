@@ -1,23 +1,31 @@
-"""The baseline Option: logic value iteration over what options were measured to take (Araki et al., 2021).
+"""The baseline Option: value iteration over what options were measured to take (Araki et al., 2021).
 
 An option reaches one sub-goal and knows nothing of what comes after it. What it takes to reach one sub-goal from
 another is measured while collecting, and what each sub-goal earns, whatever came before it ("estimated empirically for
 each individual subgoal separately"; paper, "Baseline-2"). A sequence is chosen by dynamic programming over the task
 tree with that.
 
-Axes: **O** origins, the P propositions reached before and, last, the start of an episode; **P** goals; **N** nodes.
+Axes: **O** origins, the P propositions reached before and, last, the start of an episode; **P** goals; **N** nodes;
+**B** environments of a batch; **T** time steps; **E** environments.
 """
 
 from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
+from hrlspec.agent.distributions import MASKED
+from hrlspec.agent.experience import Experience, Step, View
+from hrlspec.agent.high_level import Choice, HighLevel, Rewards
+from hrlspec.agent.low_level import LowLevel, Params, TaskBook
+from hrlspec.agent.method import Method
+from hrlspec.agent.networks.controller import Instruction, Sees
+from hrlspec.config import Checked, Config, setting
 from hrlspec.spec import TaskState, TaskTree, open_edges
-
-FADING = 0.98
-"""What is left of a measurement's weight an iteration later: options change while they are learned."""
 
 _LEAST = 1e-9
 
@@ -57,6 +65,7 @@ def measure(
     reward: jax.Array,
     *,
     discount: float,
+    fading: float,
 ) -> Measurements:
     """Adds the attempts that ended in a rollout; leading axes of all arrays ``[T, E]``.
 
@@ -70,6 +79,7 @@ def measure(
         duration: int32, steps since the sub-task was assigned, this one included.
         reward: float32, of this step.
         discount: γ.
+        fading: what is left of the weight of what was measured before.
     """
     origin, goal = origin.astype(jnp.float32), goal.astype(jnp.float32)
     success = ended & reached
@@ -82,10 +92,10 @@ def measure(
         return jnp.einsum("kte,teg->kg", weight, goal)
 
     return Measurements(
-        attempts=FADING * known.attempts + pairs(ended.astype(jnp.float32)),
-        discounted=FADING * known.discounted + pairs(success * discount ** duration.astype(jnp.float32)),
-        successes=FADING * known.successes + goals(kinds),
-        rewards=FADING * known.rewards + goals(kinds * reward),
+        attempts=fading * known.attempts + pairs(ended.astype(jnp.float32)),
+        discounted=fading * known.discounted + pairs(success * discount ** duration.astype(jnp.float32)),
+        successes=fading * known.successes + goals(kinds),
+        rewards=fading * known.rewards + goals(kinds * reward),
     )
 
 
@@ -109,13 +119,83 @@ def values(known: Measurements, tree: TaskTree, state: TaskState) -> jax.Array:
     reach = jnp.where(tree.reach, origin @ per_attempt, jnp.inf).min(-1)
     reward = jnp.where(tree.reach, per_success[:, None], -jnp.inf).max(-1)
     reward = jnp.where(tree.accepting, reward[1], reward[0])
-    edge = tree.valid & (tree.parent >= 0)
 
     def visit(best: jax.Array, node: jax.Array) -> tuple[jax.Array, jax.Array]:
         ahead = jnp.where(tree.accepting[node], 0.0, best[node])
-        value = jnp.where(edge[node], reach[node] * (reward[node] + ahead), -jnp.inf)
+        value = jnp.where(tree.edges[node], reach[node] * (reward[node] + ahead), -jnp.inf)
         return best.at[tree.parent[node]].max(value), value
 
     # Children come after their parents, so the last node is visited first.
     value = jax.lax.scan(visit, jnp.full(tree.num_nodes, -jnp.inf), jnp.arange(tree.num_nodes), reverse=True)[1]
     return jnp.where(open_edges(tree, state), value, -jnp.inf)
+
+
+@dataclasses.dataclass(frozen=True)
+class LogicValueIteration(Checked, HighLevel):
+    """Chooses options by value iteration over the task tree, with what each was measured to take and to earn."""
+
+    sharpness: float = setting(100.0, least=0, most=1e6)
+    """Logits per unit of value: at 100 a hundredth counts as much as the noise that options are sampled with."""
+    fading: float = setting(0.98, least=0, most=1)
+    """What is left of a measurement's weight an iteration later: options change while they are learned."""
+
+    def init(self, key: jax.Array, low: LowLevel, view: View, tree: TaskTree) -> Measurements:
+        """See :class:`HighLevel`."""
+        del key, low, view
+        return unmeasured(tree.num_propositions)
+
+    def choose(
+        self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
+    ) -> Choice:
+        """See :class:`HighLevel`; V^h is the low level's value of the best option."""
+        feasible = jax.vmap(open_edges)(tree, state)
+        value = jax.vmap(values, in_axes=(None, 0, 0))(params["high"], tree, state)
+        best = jnp.where(feasible.any(-1), value.max(-1), 0.0)
+        logits = jnp.where(feasible, self.sharpness * (value - best[:, None]), MASKED)
+        value = low.value_of(params, view, told, logits.argmax(-1), feasible)
+        return Choice(logits, value, jnp.zeros(logits.shape), told.ahead)
+
+    def low_level_rewards(self, experience: Experience) -> Rewards:
+        """Each option is over when its sub-task is, and earns 1 if it reached its goal, whatever the task pays."""
+        x = experience
+        reached = x.outcome.edge_taken & (x.reached == x.goal).all(-1)
+        next_decided = jnp.roll(x.high.made, -1, 1).at[:, -1].set(False)
+        over = x.outcome.edge_taken | x.outcome.terminated | next_decided
+        return Rewards(reached.astype(jnp.float32), over, x.outcome.truncated)
+
+    def observe(self, params: Measurements, book: TaskBook, steps: Step, config: Config) -> Measurements:
+        """Adds what the options of a rollout took and earned."""
+        outcome, edge = steps.outcome, steps.high.edge
+        following = jnp.roll(steps.high.made, -1, 0).at[-1].set(False)
+        return measure(
+            params,
+            jax.vmap(origins)(book.tree)[steps.task, steps.state.node],
+            book.tree.reach[steps.task, edge],
+            outcome.edge_taken | outcome.terminated | outcome.truncated | following,
+            outcome.edge_taken & (outcome.node == edge),
+            outcome.satisfied,
+            steps.since + 1,
+            outcome.reward,
+            discount=config.discount,
+            fading=self.fading,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Option(Method):
+    """Options know their own sub-goal, and value iteration over what they take chooses them; the shield stays."""
+
+    high: LogicValueIteration = LogicValueIteration()
+
+    name: ClassVar[str] = "option"
+    about: ClassVar[str] = "value iteration chooses options that know nothing of each other"
+    sees: ClassVar[Sees] = "sub-task"
+
+    def configure(self, config: Config) -> Config:
+        """Nothing of other sub-tasks, before or after."""
+        return dataclasses.replace(
+            config, network=dataclasses.replace(config.network, lookahead=0, names=False, memory=0)
+        )
+
+
+OPTION = Option()

@@ -1,1 +1,28 @@
-"""Presets: everything that a world needs to be trained, evaluated and drawn."""
+"""Presets, one file a world: everything that it needs to be trained, evaluated and drawn."""
+
+from __future__ import annotations
+
+from hrlspec.presets.generic import preset_for
+from hrlspec.presets.letter import LETTER, LETTER12
+from hrlspec.presets.preset import Preset
+from hrlspec.presets.recipes import RECIPES, Recipe, RewardSet
+from hrlspec.presets.walk import FLATWORLD, WALK
+from hrlspec.presets.zone import ZONE, ZONE_LTL2ACTION, ZONE_NM
+
+__all__ = ["PRESETS", "RECIPES", "Preset", "Recipe", "RewardSet", "preset", "preset_for"]
+
+PRESETS: dict[str, Preset] = {
+    some.name: some for some in (LETTER, LETTER12, WALK, FLATWORLD, ZONE, ZONE_LTL2ACTION, ZONE_NM)
+}
+"""The presets by name."""
+
+
+def preset(name: str) -> Preset:
+    """A preset by its name.
+
+    Raises:
+        ValueError: there is none; the message lists those there are.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"unknown environment {name!r}, expected one of: {', '.join(PRESETS)}")
+    return PRESETS[name]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hrlspec.spec.compiler import compile
+from hrlspec.spec.compiler import compile_task
 from hrlspec.spec.draw import draw_task
 from hrlspec.spec.hashing import task_hash, task_hashes
 from hrlspec.spec.monitor import RUNNING, SATISFIED, VIOLATED, TaskState, advance, initial, open_edges
@@ -47,7 +47,7 @@ __all__ = [
     "TaskTree",
     "Then",
     "advance",
-    "compile",
+    "compile_task",
     "draw_task",
     "initial",
     "open_edges",

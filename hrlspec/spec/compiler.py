@@ -28,11 +28,11 @@ from hrlspec.spec.syntax import (
 )
 from hrlspec.spec.tree import TaskTree
 
-#: Largest N that ``compile`` pads to.
+#: Largest N that ``compile_task`` pads to.
 MAX_NODES = 4096
 
 
-def compile(formula: Formula, propositions: Sequence[str], max_nodes: int) -> TaskTree:
+def compile_task(formula: Formula, propositions: Sequence[str], max_nodes: int) -> TaskTree:
     """The task tree of a formula, padded to N nodes; children stand in the order of the text.
 
     Edges of one node with the same reach and avoid sets are one edge. An accepting node has no children: the task

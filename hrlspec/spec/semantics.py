@@ -36,7 +36,7 @@ def satisfies(formula: Formula, trace: Sequence[Collection[str]]) -> bool:
     Takes time cubic in the length of the trace, with a small constant, and linear in the size of the formula.
 
     Args:
-        formula: any formula, also such as ``compile`` refuses.
+        formula: any formula, also such as ``compile_task`` refuses.
         trace: the labels of s₁…s_h, one set of names per step after the first action; nothing of s₀.
 
     Raises:

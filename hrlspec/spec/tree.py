@@ -49,14 +49,18 @@ class TaskTree:
         """P, the number of atomic propositions."""
         return self.reach.shape[-1]
 
+    @property
+    def edges(self) -> jax.Array:
+        """Which nodes are entered by an edge, bool ``[..., N]``: all valid ones but the root."""
+        return self.valid & (self.parent >= 0)
+
 
 def subtask_avoid(tree: TaskTree) -> jax.Array:
     """What each sub-task must avoid, bool ``[N, P]`` (eq. 2): own avoid, and what siblings reach, minus own reach.
 
     For siblings that reach conjunctions this forbids more than eq. (2) does: ¬(b∧c) becomes ¬b and ¬c.
     """
-    edge = tree.valid & (tree.parent >= 0)
-    siblings = (tree.parent[:, None] == tree.parent[None, :]) & edge[:, None] & edge[None, :]
+    siblings = (tree.parent[:, None] == tree.parent[None, :]) & tree.edges[:, None] & tree.edges[None, :]
     siblings &= ~jnp.eye(tree.num_nodes, dtype=bool)
     reached_by_siblings = (siblings.astype(jnp.float32) @ tree.reach.astype(jnp.float32)) > 0
     return tree.avoid | (reached_by_siblings & ~tree.reach)

@@ -16,7 +16,18 @@ import numpy as np
 from flax import struct
 
 from envs_jax.adapters.tasks import Verdict
-from hrlspec.spec import RUNNING, SATISFIED, VIOLATED, TaskState, TaskTree, advance, compile, initial, parse, subtasks
+from hrlspec.spec import (
+    RUNNING,
+    SATISFIED,
+    VIOLATED,
+    TaskState,
+    TaskTree,
+    advance,
+    compile_task,
+    initial,
+    parse,
+    subtasks,
+)
 from hrlspec.spec.subtasks import Subtask
 from hrlspec.tasks import rewards
 from hrlspec.tasks.rewards import Bonus, RewardMachine, reward_machine
@@ -114,7 +125,7 @@ class TextTasks:
 
 @functools.lru_cache(maxsize=4096)
 def _read(text: str, propositions: tuple[str, ...], max_nodes: int) -> TaskTree:
-    tree: TaskTree = jax.tree.map(np.asarray, compile(parse(text), propositions, max_nodes))
+    tree: TaskTree = jax.tree.map(np.asarray, compile_task(parse(text), propositions, max_nodes))
     return tree
 
 

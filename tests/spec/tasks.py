@@ -64,7 +64,7 @@ def harm(rng: np.random.Generator, names: list[str]) -> Condition:
 
 
 def random_formula(rng: np.random.Generator, depth: int, names: list[str] = NAMES) -> Formula:
-    """A formula that ``compile`` takes unless it is too large or can never be done; at most ``depth`` deep."""
+    """A formula that ``compile_task`` takes unless it is too large or can never be done; at most ``depth`` deep."""
     kind = rng.random()
     if depth <= 1 or kind < 0.05:
         return Achieve(goal(rng, names))

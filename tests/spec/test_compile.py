@@ -20,7 +20,7 @@ from hrlspec.spec import (
     SpecWarning,
     TaskTree,
     Then,
-    compile,
+    compile_task,
     parse,
     subtasks,
     task_hash,
@@ -36,7 +36,7 @@ Edge = tuple[frozenset[str], frozenset[str]]
 
 
 def compiled(text: str, max_nodes: int = 16) -> TaskTree:
-    return compile(parse(text), NAMES, max_nodes)
+    return compile_task(parse(text), NAMES, max_nodes)
 
 
 def paths_of_tree(tree: TaskTree) -> set[tuple[Edge, ...]]:
@@ -100,7 +100,7 @@ def test_tree_is_the_set_of_ways_to_satisfy_the_formula() -> None:
     while checked < 200:
         formula = random_formula(rng, 4)
         try:
-            tree = compile(formula, NAMES, 64)
+            tree = compile_task(formula, NAMES, 64)
         except SpecError:
             continue
         paths = {path for path in paths_of_formula(formula) if not any(reach & avoid for reach, avoid in path)}
@@ -140,10 +140,10 @@ def test_tree_to_text_and_back() -> None:
     checked = 0
     while checked < 100:
         try:
-            tree = compile(random_formula(rng, 4), NAMES, 64)
+            tree = compile_task(random_formula(rng, 4), NAMES, 64)
         except SpecError:
             continue
-        again = compile(parse(tree_to_text(tree, NAMES)), NAMES, 64)
+        again = compile_task(parse(tree_to_text(tree, NAMES)), NAMES, 64)
         assert int(task_hash(again)) == int(task_hash(tree))
         assert jax.tree.all(jax.tree.map(np.array_equal, tree, again))
         checked += 1
@@ -197,13 +197,13 @@ def test_refusals_say_where_and_why(text: str, place: tuple[int, int], words: li
 
 def test_unknown_names_suggest_a_close_one() -> None:
     with pytest.raises(SpecError, match=r"expected one of kitchen, office \(did you mean 'kitchen'\?\)"):
-        compile(parse("achieve kitchn"), ["kitchen", "office"], 4)
+        compile_task(parse("achieve kitchn"), ["kitchen", "office"], 4)
 
 
 @pytest.mark.parametrize("propositions", [["a", "a"], ["a", "not"], ["é", "e\u0301"], [""]])
 def test_bad_vocabularies(propositions: list[str]) -> None:
     with pytest.raises(SpecError):
-        compile(parse("achieve a"), propositions, 4)
+        compile_task(parse("achieve a"), propositions, 4)
 
 
 @pytest.mark.parametrize("max_nodes", [-1, 0, 1, MAX_NODES + 1])
@@ -257,7 +257,7 @@ def test_hostile_formulas_end_soon(text: str) -> None:
     start = time.process_time()
     formula = parse(text[:MAX_TEXT])
     try:
-        compile(formula, [*NAMES, *(f"p{i}" for i in range(64))], MAX_NODES)
+        compile_task(formula, [*NAMES, *(f"p{i}" for i in range(64))], MAX_NODES)
     except SpecError as error:
         message = str(error)
     else:

@@ -15,7 +15,7 @@ from hrlspec.spec import (
     SpecError,
     TaskTree,
     advance,
-    compile,
+    compile_task,
     compiler,
     conditions,
     graph,
@@ -45,7 +45,7 @@ EXAMPLES = _blocks("semantics.md", "spectrl")
 
 def _monitor(text: str, trace: list[set[str]]) -> str:
     try:
-        tree = compile(parse(text), NAMES, 16)
+        tree = compile_task(parse(text), NAMES, 16)
     except SpecError:
         return "refused"
     state = initial(tree)
@@ -74,13 +74,13 @@ def test_every_kind_of_example_is_there() -> None:
 @pytest.mark.filterwarnings("ignore::hrlspec.spec.SpecWarning")
 @pytest.mark.parametrize(("text", "same"), _rows("equal"))
 def test_equal_tasks(text: str, same: str) -> None:
-    assert int(task_hash(compile(parse(text), NAMES, 16))) == int(task_hash(compile(parse(same), NAMES, 16)))
+    assert int(task_hash(compile_task(parse(text), NAMES, 16))) == int(task_hash(compile_task(parse(same), NAMES, 16)))
 
 
 @pytest.mark.parametrize(("text", "reason"), _rows("refused"))
 def test_refused_tasks(text: str, reason: str) -> None:
     with pytest.raises(SpecError) as caught:
-        compile(parse(text), NAMES, 16)
+        compile_task(parse(text), NAMES, 16)
     assert str(caught.value).startswith(reason)
 
 

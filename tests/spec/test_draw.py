@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import pytest
 from matplotlib.figure import Figure
 
-from hrlspec.spec import SATISFIED, VIOLATED, advance, compile, draw_task, initial, parse
+from hrlspec.spec import SATISFIED, VIOLATED, advance, compile_task, draw_task, initial, parse
 from tests.spec.tasks import NAMES
 
-TASK = compile(parse("achieve a ensuring not e; (achieve b or achieve c and d) or achieve d"), NAMES, 12)
+TASK = compile_task(parse("achieve a ensuring not e; (achieve b or achieve c and d) or achieve d"), NAMES, 12)
 
 
 def _after(*steps: str):
@@ -41,7 +41,7 @@ def test_progress_shows() -> None:
     pictures = [_png(draw_task(TASK, NAMES, state)) for state in states]
     assert len(set(pictures)) == len(pictures)
     assert int(states[4].status) == SATISFIED
-    violated = compile(parse("achieve a ensuring not b"), NAMES, 4)
+    violated = compile_task(parse("achieve a ensuring not b"), NAMES, 4)
     state = advance(violated, initial(violated), jnp.array([False, True, False, False, False]), 1)
     assert int(state.status) == VIOLATED
     assert _png(draw_task(violated, NAMES, state)) != _png(draw_task(violated, NAMES))

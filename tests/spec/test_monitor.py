@@ -33,7 +33,7 @@ from hrlspec.spec import (
     TaskTree,
     Then,
     advance,
-    compile,
+    compile_task,
     initial,
     open_edges,
     parse,
@@ -73,7 +73,7 @@ def pairs() -> Pairs:
             if nesting(formula) < 3:
                 continue
             try:
-                trees.append(jax.device_get(compile(formula, NAMES, MAX_NODES)))
+                trees.append(jax.device_get(compile_task(formula, NAMES, MAX_NODES)))
             except SpecError:
                 continue  # too large, or forbids what it has to reach
             kept.append(formula)
@@ -181,14 +181,14 @@ def test_advance_compiles_once() -> None:
     step = jax.jit(chex.assert_max_traces(advance, n=1))
     labels = jnp.zeros(len(NAMES), bool)
     for text in ["achieve a", "achieve a; achieve b ensuring not c", "achieve a or achieve b"]:
-        tree = compile(parse(text), NAMES, 16)
+        tree = compile_task(parse(text), NAMES, 16)
         state = initial(tree)
         for proposition in range(3):
             state = step(tree, state, labels.at[proposition].set(True), jnp.int32(1))
 
 
 def _walk(text: str, trace: list[str], assigned: int = TaskTree.NO_NODE) -> tuple[int, int]:
-    tree = compile(parse(text), NAMES, 16)
+    tree = compile_task(parse(text), NAMES, 16)
     state = initial(tree)
     for now in trace:
         labels = jnp.array([name in now for name in NAMES])
@@ -228,7 +228,7 @@ def test_most_specific_edge_wins_unless_another_is_assigned() -> None:
 
 
 def test_open_edges_are_those_not_blocked() -> None:
-    tree = compile(parse("achieve a ensuring not c or achieve b"), NAMES, 8)
+    tree = compile_task(parse("achieve a ensuring not c or achieve b"), NAMES, 8)
     state = initial(tree)
     assert np.flatnonzero(open_edges(tree, state)).tolist() == [1, 2]
     state = advance(tree, state, jnp.array([False, False, True, False, False]), 1)
@@ -296,7 +296,7 @@ def test_steps_are_sets(trace: list) -> None:
 
 
 def test_state_is_a_pytree_of_fixed_types() -> None:
-    tree = compile(parse("achieve a"), NAMES, 4)
+    tree = compile_task(parse("achieve a"), NAMES, 4)
     state = initial(tree)
     after = jax.jit(partial(advance, tree))(state, jnp.ones(len(NAMES), bool), 0)
     chex.assert_trees_all_equal_shapes_and_dtypes(state, after)

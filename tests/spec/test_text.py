@@ -18,7 +18,7 @@ from hrlspec.spec import (
     Prop,
     SpecError,
     Then,
-    compile,
+    compile_task,
     parse,
     satisfies,
     to_text,
@@ -159,7 +159,7 @@ def test_malformed_trees_are_refused_by_every_reader(formula: Formula) -> None:
     with pytest.raises(SpecError):
         to_text(formula)
     with pytest.raises(SpecError):
-        compile(formula, NAMES, 16)
+        compile_task(formula, NAMES, 16)
     with pytest.raises(SpecError):
         satisfies(formula, [{"a"}])
 
@@ -169,7 +169,7 @@ def test_deepest_legal_trees_work() -> None:
     text = to_text(formula)
     assert parse(text) == formula == copy.deepcopy(formula)
     assert hash(parse(text)) == hash(formula)
-    assert int(compile(formula, NAMES, 100).valid.sum()) == MAX_NESTING
+    assert int(compile_task(formula, NAMES, 100).valid.sum()) == MAX_NESTING
     assert satisfies(formula, [{"a", "b"}] * MAX_NESTING)
 
 
@@ -183,7 +183,7 @@ def _survives(text: str) -> None:
         formula = parse(text)
         assert parse(to_text(formula)) == formula
         satisfies(formula, [{"a"}, {"b", "x"}])
-        compile(formula, NAMES, 64)
+        compile_task(formula, NAMES, 64)
     except SpecError as error:
         place = error.line, error.column
     assert all(number is not None and 1 <= number <= len(text) + 1 for number in place), place

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from hrlspec.spec import TaskTree, compile, parse, task_hash, task_hashes, tree_to_text
+from hrlspec.spec import TaskTree, compile_task, parse, task_hash, task_hashes, tree_to_text
 from hrlspec.tasks.sampling import sample_sequences, sample_trees
 from tests.spec.tasks import NAMES
 from tests.spec.test_compile import check_shape
@@ -239,4 +239,4 @@ def test_sampled_trees_have_text() -> None:
     for batch in (trees, lines):
         for m, expected in enumerate(task_hashes(batch)):
             text = tree_to_text(row(batch, m), NAMES)
-            assert int(task_hash(compile(parse(text), NAMES, 20))) == int(expected)
+            assert int(task_hash(compile_task(parse(text), NAMES, 20))) == int(expected)

@@ -5,35 +5,62 @@ Axes: **N** tree nodes, **P** atomic propositions, **F** features.
 
 from __future__ import annotations
 
+import dataclasses
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from hrlspec.agent.distributions import MASKED
 from hrlspec.agent.networks.encoder import MLP, Encoder, initializer
 from hrlspec.agent.networks.tree import sum_to_parents, sweep_up
-from hrlspec.config import NetworkConfig
+from hrlspec.config import Checked, NetworkConfig, setting
 from hrlspec.spec import TaskState, TaskTree, open_edges, subtask_avoid
 
-MASKED = -1e9
+
+@dataclasses.dataclass(frozen=True)
+class PlannerConfig(Checked):
+    """Sizes of the planner's networks (paper, "High-level Architecture"), and what they see."""
+
+    features: int = setting(64, least=1)
+    """F, node features of the GNN."""
+    hidden: int = setting(128, least=1)
+    """Hidden units of the transition model and the critic."""
+    policy: tuple[int, ...] = setting((128, 128, 128), least=1)
+    """Hidden units of the policy, which is applied to every edge."""
+    rounds: int = setting(8, least=0)
+    """Rounds of message passing, each normalised; look-ahead ends at this depth. 0: one sweep from the leaves to the
+    root, which looks ahead without limit and costs an eighth."""
+    child_embeddings: bool = False
+    """Whether the logit of an edge also sees the embedding of the node it leads to."""
+    advice: float = setting(0.0, least=0, most=1e6)
+    """Weight of the low level's value of each candidate sub-task in the logits (gradient stopped); the planner learns a
+    correction to it. 0: the planner judges alone, as in the paper."""
 
 
 class Planner(nn.Module):
-    """Encoder E, latent transition model T, tree GNN (M, U), policy and value, trained end to end."""
+    """Encoder E, latent transition model T, tree GNN (M, U), policy and value, trained end to end.
 
-    config: NetworkConfig
+    Attributes:
+        config: sizes.
+        encoding: sizes of the encoder.
+    """
+
+    config: PlannerConfig
+    encoding: NetworkConfig
 
     def setup(self) -> None:
         """Declares the parts under the paper's names."""
-        c = self.config
-        features = c.planner_features
-        self.encoder = Encoder(c.latent, c.conv_channels, c.encoder_mlp)
-        self.transition = MLP((c.planner_hidden, c.planner_hidden, c.latent), final_scale=0.1)
+        c, e = self.config, self.encoding
+        features = c.features
+        self.encoder = Encoder(e.latent, e.conv_channels, e.encoder_mlp)
+        self.transition = MLP((c.hidden, c.hidden, e.latent), final_scale=0.1)
         self.project = nn.Dense(features, kernel_init=initializer(1.0))
         self.message = MLP((features, features))
         self.update = MLP((features, features))
         self.normalise = nn.LayerNorm(use_bias=False, use_scale=False)
-        self.policy = MLP((*c.planner_policy, 1), final_scale=0.01)
-        self.value = MLP((c.planner_hidden, c.planner_hidden, 1), tanh=True, final_scale=1.0)
+        self.policy = MLP((*c.policy, 1), final_scale=0.01)
+        self.value = MLP((c.hidden, c.hidden, 1), tanh=True, final_scale=1.0)
 
     def encode(self, view: tuple[jax.Array, jax.Array]) -> jax.Array:
         """Latent of one observation, float32 ``[latent]``."""
@@ -63,9 +90,9 @@ class Planner(nn.Module):
         """
         goal = tree.reach.astype(jnp.float32)
         edge = jnp.concatenate([goal, subtask_avoid(tree).astype(jnp.float32)], -1)
-        sends = tree.valid & (tree.parent >= 0) & ~state.blocked
+        sends = tree.edges & ~state.blocked
         x = self.project(latents)
-        if not self.config.planner_rounds:
+        if not self.config.rounds:
 
             def visit(self: Planner, incoming: jax.Array, node: jax.Array) -> tuple[jax.Array, jax.Array]:
                 parent = tree.parent[node]
@@ -74,7 +101,7 @@ class Planner(nn.Module):
                 return incoming.at[parent].add(self.message(sent) * sends[node]), here
 
             return sweep_up(visit, self, jnp.zeros_like(x))
-        for _ in range(self.config.planner_rounds):
+        for _ in range(self.config.rounds):
             x = jnp.concatenate([x, goal], -1)
             incoming = self.message(jnp.concatenate([x, x[tree.parent], edge], -1))
             x = self.update(jnp.concatenate([x, sum_to_parents(incoming, tree.parent, sends)], -1))

@@ -45,7 +45,7 @@ def lookahead(tree: TaskTree, depth: int) -> jax.Array:
     ahead = []
     reach = tree.reach.astype(jnp.float32)
     for _ in range(depth):
-        reach = sum_to_parents(reach, tree.parent, tree.valid & (tree.parent >= 0))
+        reach = sum_to_parents(reach, tree.parent, tree.edges)
         ahead.append(reach > 0)
     return jnp.stack(ahead, 1) if ahead else jnp.zeros((tree.num_nodes, 0, tree.num_propositions), bool)
 
@@ -106,7 +106,7 @@ class TaskEmbedding(nn.Module):
         """Embeds all progressions of one task, float32 ``[N, F]``."""
         if not self.rounds:
             return self._sweep(tree)[0]
-        sends = tree.valid & (tree.parent >= 0)
+        sends = tree.edges
         edge = self._edge(tree)
         x = jnp.zeros((tree.num_nodes, self.features))
         for _ in range(self.rounds):
@@ -127,7 +127,7 @@ class TaskEmbedding(nn.Module):
 
     def _sweep(self, tree: TaskTree) -> tuple[jax.Array, jax.Array]:
         """Embeddings of all progressions, and the message sent along each edge, ``[N, F]`` each."""
-        sends = tree.valid & (tree.parent >= 0)
+        sends = tree.edges
         edge = self._edge(tree)
         nothing = jnp.zeros((tree.num_nodes, self.features))
         bias = self.own(nothing[0])
@@ -139,7 +139,7 @@ class TaskEmbedding(nn.Module):
 
         return sweep_up(visit, self, nothing)
 
-    def of_way(self, ahead: jax.Array) -> jax.Array:
+    def of_sequence(self, ahead: jax.Array) -> jax.Array:
         """Embeds a sequence of sub-tasks as the sweep would, ``[F]``; p₊ is ``[D, P]``, empty rows after its end."""
         bias = self.own(jnp.zeros(self.features))
         x = nn.tanh(bias)

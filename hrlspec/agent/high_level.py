@@ -1,0 +1,143 @@
+"""The high level as an interface: it chooses the next sub-task and says what the remaining task is worth.
+
+Implementations live with their methods, in ``hrlspec/methods``. They are static, hashable values (frozen dataclasses of
+settings); what they learn lives in ``params["high"]``.
+
+Axes: **B** environments of a batch, **N** tree nodes, **D** later sub-tasks, **P** atomic propositions, **T** time
+steps, **E** environments, **V** environments and relabelled copies.
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import Any, NamedTuple
+
+import jax
+from flax import struct
+
+from hrlspec.agent.distributions import Categorical
+from hrlspec.agent.experience import Experience, HighBatch, Step, View
+from hrlspec.agent.low_level import LowLevel, Params, TaskBook
+from hrlspec.agent.networks.controller import Instruction
+from hrlspec.config import Config, PPOConfig
+from hrlspec.spec import TaskState, TaskTree
+
+Metrics = dict[str, jax.Array]
+
+
+@struct.dataclass
+class Choice:
+    """What the high level thinks of the open edges; leading axis B."""
+
+    logits: jax.Array  # float32 [B, N], over edges
+    value: jax.Array  # float32 [B], V^h of the remaining task
+    advice: jax.Array  # float32 [B, N], what the low level said of each edge; zeros where it was not asked
+    ahead: jax.Array  # float32 [B, N, D, P], what would be meant to be reached after each edge
+
+
+class Judgement(NamedTuple):
+    """What the high level thinks of a choice that something else made; leading axis B."""
+
+    log_prob: jax.Array  # float32 [B]
+    value: jax.Array  # float32 [B]
+    advice: jax.Array  # float32 [B, N]
+
+
+class Rewards(NamedTuple):
+    """What the low level learns from, leading axes ``[V, T]``."""
+
+    reward: jax.Array  # float32
+    terminated: jax.Array  # bool
+    truncated: jax.Array  # bool
+
+
+class HighLevel(abc.ABC):
+    """Chooses sub-tasks. `init` and `choose` are what acting needs; `loss` and `observe` are how it learns."""
+
+    ppo: PPOConfig | None = None
+    """How `loss` is descended; ``None`` where nothing is learned by gradient."""
+    max_operator: bool = False
+    """Whether the low level's target at a new sub-task is raised to V^h (eq. 6)."""
+    learns_unfinished: bool = False
+    """Whether sub-tasks that were assigned but not completed are learned from."""
+    learns_from_copies: bool = False
+    """Whether the policy learns from relabelled copies, whose path it did not choose; the rest always does."""
+
+    @property
+    def follows_plan(self) -> bool:
+        """Whether a choice comes with the sequence of sub-tasks that is meant to follow it."""
+        return False
+
+    def num_samples(self, config: Config) -> int:
+        """B, decisions that an iteration learns from at most."""
+        return config.steps_per_iteration
+
+    def check(self, config: Config) -> None:
+        """Refuses shared settings that do not go with these.
+
+        Raises:
+            ConfigError: naming the setting, what was found and what was expected.
+        """
+        del config
+
+    @abc.abstractmethod
+    def init(self, key: jax.Array, low: LowLevel, view: View, tree: TaskTree) -> Any:
+        """What ``params["high"]`` begins as: where `ppo` is given, standard deviations of the weights to be drawn.
+
+        Args:
+            key: consumed.
+            low: the low level.
+            view: an observation, for shapes.
+            tree: a task, for shapes.
+        """
+
+    @abc.abstractmethod
+    def choose(
+        self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
+    ) -> Choice:
+        """What it thinks of the open edges in B environments.
+
+        Args:
+            low: the low level, which may be asked.
+            params: parameters of all parts.
+            view: what is seen.
+            tree: the tasks.
+            state: where they stand.
+            told: the instruction for each edge, leading axes ``[B, N]``.
+        """
+
+    def judge(
+        self,
+        low: LowLevel,
+        params: Params,
+        view: View,
+        tree: TaskTree,
+        state: TaskState,
+        told: Instruction,
+        edge: jax.Array,
+    ) -> Judgement:
+        """What it thinks of choosing ``edge`` (int32 ``[B]``), which relabelling made the task's own path."""
+        choice = self.choose(low, params, view, tree, state, told)
+        log_prob = jax.vmap(Categorical(choice.logits.shape[-1]).log_prob)(choice.logits, edge)
+        return Judgement(log_prob, choice.value, choice.advice)
+
+    def low_level_rewards(self, experience: Experience) -> Rewards:
+        """What the low level is paid, and when that ends: the task's rewards, until the episode ends."""
+        outcome = experience.outcome
+        return Rewards(outcome.reward, outcome.terminated, outcome.truncated)
+
+    def loss(self, low: LowLevel, params: Any, batch: HighBatch, progress: jax.Array) -> tuple[jax.Array, Metrics]:
+        """Loss of ``params["high"]``, which ``params`` is, on a minibatch; called where `ppo` is given.
+
+        Args:
+            low: the low level.
+            params: parameters of this part.
+            batch: decisions and what they led to.
+            progress: float32 ``[]``, share of the training that is done.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has nothing to learn by gradient")
+
+    def observe(self, params: Any, book: TaskBook, steps: Step, config: Config) -> Any:
+        """``params["high"]`` after a rollout ``[T, E]``, for what is measured rather than learned by gradient."""
+        del book, steps, config
+        return params

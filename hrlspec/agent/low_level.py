@@ -1,0 +1,139 @@
+"""The low level: what it is told of a task, how it acts, and the reach critic behind its shield.
+
+Axes: **N** tree nodes, **P** atomic propositions, **D** later sub-tasks, **K** candidate actions, **M** tasks,
+**B** environments of a batch.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from envs_jax import Environment, Symmetric
+from hrlspec.agent.distributions import Distribution, distribution_over
+from hrlspec.agent.experience import View
+from hrlspec.agent.networks.controller import Controller, Instruction, Sees
+from hrlspec.agent.networks.reach_critic import ReachCritic
+from hrlspec.config import Config
+from hrlspec.spec import TaskTree
+
+Params = dict[str, Any]
+"""Parameters by part: ``low``, ``high`` and ``reach_critic``."""
+
+
+@struct.dataclass
+class TaskBook:
+    """M tasks, and what the low level is told of them, computed once per task and parameters.
+
+    Attributes:
+        tree: the tasks, leading axis M.
+        told: the instruction for each edge, leading axes ``[M, N]``.
+    """
+
+    tree: TaskTree
+    told: Instruction
+
+
+@dataclasses.dataclass(frozen=True)
+class LowLevel:
+    """The low level's networks for one environment. Static: its parameters are an argument.
+
+    Attributes:
+        env: the environment it acts in.
+        config: the run's configuration.
+        sees: what it is told of the task.
+        follows_plan: whether the high level hands it the sequence that it means to follow.
+    """
+
+    env: Environment
+    config: Config
+    sees: Sees
+    follows_plan: bool
+
+    @functools.cached_property
+    def actions(self) -> Distribution:
+        """What the policy is a distribution over."""
+        return distribution_over(self.env.action_space)
+
+    @functools.cached_property
+    def controller(self) -> Controller:
+        """The policy's and the value's network."""
+        return Controller(
+            self.config.network,
+            self.actions.num_outputs,
+            self.sees,
+            self.follows_plan,
+            self.env.symmetries if isinstance(self.env, Symmetric) else None,
+        )
+
+    @functools.cached_property
+    def reach_critic(self) -> ReachCritic:
+        """The critic behind the shield."""
+        return ReachCritic(self.config.network.reach_critic, self.actions)
+
+    def instruct(self, params: Params, tree: TaskTree) -> Instruction:
+        """The instruction for every edge of one task, leading axis N."""
+        return cast(Instruction, self.controller.apply(params["low"], tree, method="instruct"))
+
+    def open_book(self, params: Params, trees: TaskTree) -> TaskBook:
+        """Prepares tasks (leading axis M) for acting."""
+        return TaskBook(tree=trees, told=jax.vmap(self.instruct, in_axes=(None, 0))(params, trees))
+
+    def told_now(
+        self,
+        params: Params,
+        told: Instruction,
+        where: tuple[jax.Array, ...],
+        edge: jax.Array,
+        feasible: jax.Array,
+        ahead: jax.Array,
+    ) -> Instruction:
+        """What the low level is told at single moments.
+
+        Args:
+            params: the networks' parameters.
+            told: the instructions for whole tasks, as a book has them: any leading axes, then N.
+            where: indices of the moments' tasks, one for each leading axis.
+            edge: int32 ``[...]``, the edges in force.
+            feasible: bool ``[..., N]``, the open ones; read where the whole task is told.
+            ahead: float32 ``[..., D, P]``, what the high level means to reach afterwards.
+        """
+        if self.sees != "whole task":
+            return dataclasses.replace(jax.tree.map(lambda x: x[(*where, edge)], told), ahead=ahead)
+        future = self.controller.apply(params["low"], told.future[where], feasible, method="remaining")
+        nothing = jnp.zeros((*edge.shape, told.reach.shape[-1]))
+        behind = jnp.zeros((*edge.shape, 0, told.reach.shape[-1]))
+        return Instruction(reach=nothing, avoid=nothing, ahead=ahead, behind=behind, future=cast(jax.Array, future))
+
+    def control(self, params: Params, view: View, told: Instruction) -> tuple[jax.Array, jax.Array]:
+        """What describes the policy on one environment (see ``actions``), and the value ``[]``."""
+        return cast("tuple[jax.Array, jax.Array]", self.controller.apply(params["low"], view, told))
+
+    def value_of(
+        self, params: Params, view: View, told: Instruction, edge: jax.Array, feasible: jax.Array
+    ) -> jax.Array:
+        """V^l of pursuing an edge in each of B environments, ``[B]``.
+
+        Args:
+            params: the networks' parameters.
+            view: what is seen.
+            told: the instruction for each edge, leading axes ``[B, N]``.
+            edge: int32 ``[B]``.
+            feasible: bool ``[B, N]``, the open edges.
+        """
+        rows = jnp.arange(edge.shape[0])
+        now = self.told_now(params, told, (rows,), edge, feasible, told.ahead[rows, edge])
+        return jax.vmap(self.control, in_axes=(None, 0, 0))(params, view, now)[1]
+
+    def reach_values(self, params: Params, view: View) -> jax.Array:
+        """Q(s, g, a) of reaching each proposition by each candidate action, float32 ``[P, K]``."""
+        return cast(jax.Array, self.reach_critic.apply(params["reach_critic"], view))
+
+    def reach_values_of(self, params: Params, view: View, action: jax.Array) -> jax.Array:
+        """Q(s, g, a) of reaching each proposition by one action, float32 ``[P]``."""
+        return cast(jax.Array, self.reach_critic.apply(params["reach_critic"], view, action, method="of"))

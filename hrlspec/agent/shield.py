@@ -1,0 +1,32 @@
+"""The shield: no action that would step on a forbidden proposition (paper, "Avoiding Propositions").
+
+Axes: **P** atomic propositions, **A** components of an action.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from hrlspec.agent.experience import View
+from hrlspec.agent.low_level import LowLevel, Params
+
+
+def shielded_action(low: LowLevel, params: Params, view: View, avoid: jax.Array, action: jax.Array) -> jax.Array:
+    """Replaces the action where a forbidden proposition is near.
+
+    With k = argmax over p₋ of V(s, g_k): if V(s, g_k) > ν, the action becomes argmin_a Q(s, g_k, a). Maxima and minima
+    are over the candidate actions: exact for discrete actions.
+
+    Args:
+        low: the networks.
+        params: their parameters.
+        view: one observation.
+        avoid: bool ``[P]``, p₋ of the sub-task in force.
+        action: int32 ``[]`` or float32 ``[A]``, what the policy drew.
+    """
+    values = jnp.where(avoid[:, None], low.reach_values(params, view), 0.0)
+    danger = values.max(-1)
+    nearest = jnp.argmax(danger)
+    safest = low.actions.candidates()[jnp.argmin(values[nearest])]
+    return jnp.where(danger[nearest] > low.config.shield.threshold, safest, action)

@@ -1,0 +1,170 @@
+"""Two doors to the library: `train` an agent, `evaluate` it. Everything behind them can be used by itself.
+
+Axes: **S** seeds trained side by side.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs_jax import Environment
+from hrlspec.agent.agent import Agent
+from hrlspec.agent.low_level import Params
+from hrlspec.agent.method import Method
+from hrlspec.config import evolve
+from hrlspec.evaluation import Suite, SuiteResult, evaluate_suite, suite_from_text
+from hrlspec.learning.train import Trainer, TrainState
+from hrlspec.presets import Preset, Recipe, RewardSet, preset, preset_for
+from hrlspec.presets.suites import reserved_hashes
+from hrlspec.spec import TaskTree
+from hrlspec.tasks.bank import TaskBanks, seed_of
+from hrlspec.tasks.rewards import RewardMachine
+
+Progress = Callable[[int, Mapping[str, np.ndarray]], object]
+"""Called after each iteration with the environment steps done and its metrics, float32 ``[]``, or ``[S]``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainedAgent:
+    """An agent with parameters.
+
+    Attributes:
+        agent: environment, settings and method.
+        params: parameters, leading axis S where S seeds were trained side by side.
+        rewards: what it was trained for.
+    """
+
+    agent: Agent
+    params: Params
+    rewards: RewardMachine
+
+    def __getitem__(self, seed: int) -> TrainedAgent:
+        """One of S agents trained side by side."""
+        return dataclasses.replace(self, params=jax.tree.map(lambda x: x[seed], self.params))
+
+
+def train(
+    key: jax.Array,
+    env: str | Environment,
+    *,
+    total_steps: int | None = None,
+    method: str | Method = "ours",
+    recipe: Recipe = "hrlspec",
+    reward_set: RewardSet = 1,
+    changes: Mapping[str, Any] | None = None,
+    held_out: Suite | None = None,
+    progress: Progress | None = None,
+) -> TrainedAgent:
+    """Trains an agent on a curriculum of random tasks (paper, "Algorithm").
+
+    Args:
+        key: one key, or S keys for S agents trained side by side (vmapped), each as it would be by itself.
+        env: the name of a preset, or any environment; its settings are then chosen by its spaces.
+        total_steps: environment steps for each agent; the preset's if not given.
+        method: one of `hrlspec.methods.METHODS` by name, or a value of a `hrlspec.methods.Method`.
+        recipe: ``paper``, the paper's method, or ``hrlspec``, what measured better.
+        reward_set: 1, for completing the task, or 2, also for sub-tasks and for some orders of them.
+        changes: shared settings to change, by dotted names such as ``{"low.optimiser.learning_rate": 1e-3}``.
+        held_out: tasks that must not be trained on, besides the preset's test suites.
+        progress: told after each iteration; waits for it, which costs a little.
+
+    Raises:
+        ValueError: there is no such preset or method, or no training task can be drawn.
+        ConfigError: a setting cannot be meant.
+    """
+    world = preset(env) if isinstance(env, str) else preset_for(env)
+    config, chosen = world.settings(method, recipe, reward_set)
+    config = evolve(config, {**(changes or {}), **({} if total_steps is None else {"total_steps": total_steps})})
+    agent, machine = Agent(world.make(), config, chosen), world.rewards(reward_set)
+    reserved = _reserved(world, held_out)
+    return TrainedAgent(agent, _params(key, Trainer(agent), machine, reserved, progress), machine)
+
+
+def evaluate(
+    key: jax.Array,
+    trained: TrainedAgent,
+    tasks: str | Suite,
+    *,
+    episodes: int = 500,
+    seed: int = 0,
+    greedy: bool = False,
+    shield: bool = False,
+) -> SuiteResult:
+    """Lets a trained agent carry out tasks in random layouts.
+
+    Args:
+        key: of the agent's and the environment's randomness; consumed.
+        trained: one agent.
+        tasks: SPECTRL, one formula a line, or a suite.
+        episodes: in all; at least one for each task.
+        seed: of the layouts.
+        greedy: take the most likely action and sub-task instead of sampling.
+        shield: replace actions that would step on forbidden propositions.
+
+    Raises:
+        SpecError: a task cannot be read.
+        ValueError: a task cannot be satisfied in (nearly) any layout.
+    """
+    agent = trained.agent
+    suite = suite_from_text("tasks", tasks, agent.env.propositions) if isinstance(tasks, str) else tasks
+    return evaluate_suite(
+        key,
+        agent,
+        trained.params,
+        trained.rewards,
+        suite,
+        layouts_per_task=-(-episodes // len(suite)),
+        seed=seed,
+        greedy=greedy,
+        shield=shield,
+    )
+
+
+def _params(
+    key: jax.Array, trainer: Trainer, machine: RewardMachine, reserved: np.ndarray, progress: Progress | None
+) -> Params:
+    """Parameters after all iterations, for one key or S keys."""
+    config, num_propositions = trainer.agent.config, trainer.agent.env.num_propositions
+    banks = [TaskBanks(seed_of(one), config.curriculum, num_propositions, reserved) for one in jnp.atleast_1d(key)]
+    side_by_side = key.ndim > 0
+    init, iterate = (_init_all, _iterate_all) if side_by_side else (Trainer.init, Trainer.iterate)
+
+    def bank(iteration: int) -> TaskTree:
+        each = [some.at(iteration) for some in banks]
+        tree: TaskTree = jax.tree.map(lambda *x: jnp.stack(x), *each) if side_by_side else each[0]
+        return tree
+
+    state, held_out = init(trainer, key, bank(0), machine), jnp.asarray(reserved)
+    for i in range(config.num_iterations):
+        state, metrics = iterate(trainer, state, bank(i), machine, held_out)
+        if progress is not None:
+            progress((i + 1) * config.steps_per_iteration, jax.device_get(metrics))
+    params: Params = state.params
+    return params
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _init_all(trainer: Trainer, keys: jax.Array, banks: TaskTree, machine: RewardMachine) -> Any:
+    """`Trainer.init` for S seeds, each with a bank of its own."""
+    return jax.vmap(trainer.init, in_axes=(0, 0, None))(keys, banks, machine)
+
+
+@functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
+def _iterate_all(
+    trainer: Trainer, states: TrainState, banks: TaskTree, machine: RewardMachine, reserved: jax.Array
+) -> Any:
+    """`Trainer.iterate` for S seeds."""
+    return jax.vmap(trainer.iterate, in_axes=(0, 0, None, None))(states, banks, machine, reserved)
+
+
+def _reserved(world: Preset, held_out: Suite | None) -> np.ndarray:
+    """Sorted hashes of tasks that training must not see, uint32."""
+    own = reserved_hashes(world.name)
+    return own if held_out is None else np.union1d(own, held_out.hashes)

@@ -1,0 +1,235 @@
+"""From rollouts to experience: what was collected, and relabelled copies of it, under one roof.
+
+A relabelled copy of an environment's rollout counts as one more environment, so that both levels learn from originals
+and copies with the same code.
+
+Axes: **V** environments and relabelled copies, **E** environments, **T** time steps, **S** episodes (slots), **N** tree
+nodes, **P** atomic propositions, **R** rows: V·T steps one after the other.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from hrlspec.agent.agent import Agent
+from hrlspec.agent.experience import Bootstrap, Experience, HighDecision, LowDecision, Outcome, Step, View
+from hrlspec.agent.groups import in_groups
+from hrlspec.agent.high_level import Judgement
+from hrlspec.agent.low_level import Params, TaskBook
+from hrlspec.agent.networks.controller import Instruction
+from hrlspec.learning.relabel import Record, Relabelled, relabel, visits
+from hrlspec.spec import RUNNING, TaskState, initial
+from hrlspec.tasks.rewards import RewardMachine
+
+JUDGED_AT_ONCE = 128
+"""Choices of copies that the high level judges at a time."""
+
+
+def gather(
+    key: jax.Array,
+    agent: Agent,
+    params: Params,
+    machine: RewardMachine,
+    book: TaskBook,
+    steps: Step,
+    reserved: jax.Array,
+) -> Experience:
+    """A rollout ``[T, E]`` and relabelled copies of a share of its environments. The key is consumed.
+
+    Args:
+        key: of the relabelling.
+        agent: both levels.
+        params: their parameters.
+        machine: the rewards.
+        book: the tasks of the rollout.
+        steps: the rollout.
+        reserved: uint32, sorted hashes of held-out tasks, which relabelling must not produce.
+    """
+    config = agent.config
+    by_env = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), steps)
+    parts = [originals(book, by_env, config.episode_slots)]
+    if config.num_copies:
+        offset = jax.random.randint(key, (), 0, config.num_envs)
+        chosen = (offset + jnp.arange(config.num_copies)) % config.num_envs
+        keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, chosen)
+        some = jax.tree.map(lambda x: x[chosen], by_env)
+        parts.append(copies(keys, agent, params, machine, book, some, reserved))
+    merged: Experience = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+    return merged
+
+
+def originals(book: TaskBook, rollout: Step, num_slots: int) -> Experience:
+    """The rollout as it was, ``[E, T]``; episodes beyond the last slot are marked invalid."""
+    envs = jnp.arange(rollout.episode.shape[0])[:, None]
+    tasks = jnp.zeros((envs.shape[0], num_slots), jnp.int32)
+    tasks = tasks.at[envs, rollout.episode].set(rollout.task, mode="drop")
+    valid = rollout.episode < num_slots
+    return Experience(
+        trees=jax.tree.map(lambda x: x[tasks], book.tree),
+        slot=jnp.minimum(rollout.episode, num_slots - 1),
+        view=rollout.view,
+        state=rollout.state,
+        high=rollout.high,
+        low=rollout.low,
+        outcome=rollout.outcome,
+        bootstrap=rollout.bootstrap,
+        goal=book.tree.reach[rollout.task, rollout.high.edge],
+        reached=book.tree.reach[rollout.task, rollout.outcome.node],
+        learns_low=valid & ~rollout.low.shielded,
+        learns_high=jnp.ones_like(valid),
+        valid=valid,
+    )
+
+
+def copies(
+    keys: jax.Array,
+    agent: Agent,
+    params: Params,
+    machine: RewardMachine,
+    book: TaskBook,
+    rollout: Step,
+    reserved: jax.Array,
+) -> Experience:
+    """Relabelled copies of the given environments' rollouts, with both levels' opinion of them under the new tasks."""
+    record = _record(agent, book, rollout)
+    new = _relabelled(keys, agent, machine, record, reserved)
+    shape = rollout.episode.shape
+    slot = jnp.minimum(rollout.episode, new.tree.parent.shape[1] - 1)
+    row = (jnp.arange(shape[0])[:, None] * new.tree.parent.shape[1] + slot).reshape(-1)
+    fresh = agent.low.open_book(params, jax.tree.map(_flat, new.tree))
+    view, edge, node = jax.tree.map(_flat, (rollout.view, new.assigned, new.node))
+    told = _told(agent, params, fresh, row, edge, node, new)
+    outputs, value = jax.vmap(agent.low.control, in_axes=(None, 0, 0))(params, view, told)
+    log_prob = jax.vmap(agent.low.actions.log_prob)(outputs, _flat(rollout.low.action))
+    judgement = _judged(agent, params, fresh, view, row, node, edge, _flat(new.decided))
+
+    def shaped(x: Any) -> Any:
+        return jax.tree.map(lambda leaf: leaf.reshape((*shape, *leaf.shape[1:])), x)
+
+    nothing, no = jnp.zeros_like(new.reward), jnp.zeros_like(new.valid)
+    corrected = agent.config.relabel.corrected
+    return Experience(
+        trees=new.tree,
+        slot=slot,
+        view=rollout.view,
+        state=TaskState(
+            node=new.node,
+            blocked=jnp.zeros((*shape, new.tree.num_nodes), bool),
+            status=jnp.full(shape, RUNNING, jnp.int32),
+        ),
+        high=HighDecision(
+            made=new.decided,
+            edge=new.assigned,
+            ahead=shaped(told.ahead),
+            # The path was no choice: its probability counts relative to 1.
+            log_prob=nothing if corrected else shaped(judgement.log_prob),
+            value=shaped(judgement.value),
+            advice=shaped(judgement.advice),
+        ),
+        low=LowDecision(
+            action=rollout.low.action,
+            log_prob=rollout.low.log_prob if corrected else shaped(log_prob),
+            value=shaped(value),
+            shielded=rollout.low.shielded,
+        ),
+        outcome=Outcome(
+            labels=rollout.outcome.labels,
+            node=new.assigned,
+            edge_taken=record.edge_taken & new.valid,
+            satisfied=new.terminated,
+            reward=new.reward,
+            terminated=new.terminated | ~new.valid,
+            truncated=no,
+        ),
+        bootstrap=Bootstrap(low=nothing, high=nothing),
+        goal=record.reach,
+        reached=record.reach,
+        learns_low=new.valid & ~rollout.low.shielded,
+        learns_high=jnp.full_like(new.valid, agent.high.learns_from_copies),
+        valid=new.valid,
+    )
+
+
+def _record(agent: Agent, book: TaskBook, rollout: Step) -> Record:
+    """What relabelling needs, ``[E, T]``."""
+    edge = rollout.outcome.node
+    record = Record(
+        slot=rollout.episode,
+        labels=rollout.outcome.labels,
+        edge_taken=rollout.outcome.edge_taken,
+        reach=book.tree.reach[rollout.task, edge],
+        avoid=book.tree.avoid[rollout.task, edge],
+    )
+    return jax.vmap(visits)(record) if agent.config.relabel.hindsight else record
+
+
+def _relabelled(
+    keys: jax.Array, agent: Agent, machine: RewardMachine, record: Record, reserved: jax.Array
+) -> Relabelled:
+    """The new tasks, leading axis E."""
+    config = agent.config
+
+    def one(key: jax.Array, record: Record) -> Relabelled:
+        return relabel(
+            key,
+            record,
+            machine,
+            reserved,
+            num_slots=config.episode_slots,
+            max_path=config.curriculum.levels,
+            max_nodes=config.curriculum.max_nodes,
+            max_avoid=config.curriculum.max_avoid,
+            branch=config.relabel.branch,
+        )
+
+    return jax.vmap(one)(keys, record)
+
+
+def _told(
+    agent: Agent, params: Params, fresh: TaskBook, row: jax.Array, edge: jax.Array, node: jax.Array, new: Relabelled
+) -> Instruction:
+    """What the low level would have been told under the new tasks, leading axis R."""
+    tree = fresh.tree
+    feasible = tree.valid[row] & (tree.parent[row] == node[:, None])
+    told = agent.low.told_now(params, fresh.told, (row,), edge, feasible, fresh.told.ahead[row, edge])
+    if agent.high.follows_plan and agent.method.sees == "future":
+        # The plan of a relabelled task is the path that was completed; its nodes follow one another.
+        later = edge[:, None] + 1 + jnp.arange(told.ahead.shape[1])
+        on_path = later <= new.path_length.reshape(-1)[row][:, None]
+        ahead = tree.reach[row[:, None], jnp.minimum(later, tree.num_nodes - 1)] & on_path[..., None]
+        told = dataclasses.replace(told, ahead=ahead.astype(jnp.float32))
+    return told
+
+
+def _judged(
+    agent: Agent,
+    params: Params,
+    fresh: TaskBook,
+    view: View,
+    row: jax.Array,
+    node: jax.Array,
+    edge: jax.Array,
+    decided: jax.Array,
+) -> Judgement:
+    """What the high level thinks of the completed path's choices, leading axis R; zeros where there was none."""
+
+    def judge(inputs: tuple[View, jax.Array, jax.Array, jax.Array]) -> Judgement:
+        view, row, node, edge = inputs
+        tree, told = jax.tree.map(lambda x: x[row], (fresh.tree, fresh.told))
+        state = dataclasses.replace(jax.vmap(initial)(tree), node=node)
+        return agent.high.judge(agent.low, params, view, tree, state, told, edge)
+
+    nothing = jnp.zeros(decided.shape)
+    unknown = Judgement(nothing, nothing, jnp.zeros((*decided.shape, fresh.tree.num_nodes)))
+    if agent.high.ppo is None:
+        return unknown
+    return in_groups(judge, decided, (view, row, node, edge), unknown, JUDGED_AT_ONCE)
+
+
+def _flat(x: jax.Array) -> jax.Array:
+    """Merges the two leading axes."""
+    return x.reshape((x.shape[0] * x.shape[1], *x.shape[2:]))

@@ -1,0 +1,88 @@
+"""Gradient descent: one guarded step, and epochs of minibatches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from hrlspec.config import OptimiserConfig
+
+Metrics = dict[str, jax.Array]
+Loss = Callable[[Any], tuple[jax.Array, Metrics]]
+
+
+def optimiser(config: OptimiserConfig) -> optax.GradientTransformation:
+    """Adam behind a global-norm clip, without a learning rate: :func:`gradient_step` applies the annealed one.
+
+    All parameters form one vector: a handful of operations to compile instead of as many for each layer.
+    """
+    return optax.flatten(optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)))
+
+
+def annealed(first: float, last: float, progress: jax.Array) -> jax.Array:
+    """Linear from ``first`` to ``last`` as ``progress`` goes from 0 to 1."""
+    return first + (last - first) * jnp.clip(progress, 0.0, 1.0)
+
+
+def gradient_step(
+    loss: Loss,
+    params: Any,
+    state: optax.OptState,
+    transform: optax.GradientTransformation,
+    learning_rate: jax.Array,
+) -> tuple[Any, optax.OptState, Metrics]:
+    """One step; a non-finite loss or gradient leaves everything as it was and is counted in ``skipped``."""
+    (value, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(params)
+    norm = optax.tree.norm(gradient)
+    finite = jnp.isfinite(norm) & jnp.isfinite(value)
+    updates, new_state = transform.update(gradient, state, params)
+    stepped = jax.tree.map(lambda p, u: p - learning_rate * u, params, updates)
+    params, state = jax.tree.map(lambda new, old: jnp.where(finite, new, old), (stepped, new_state), (params, state))
+    return params, state, {**metrics, "grad_norm": norm, "skipped": 1.0 - finite}
+
+
+def fit(
+    key: jax.Array,
+    loss: Callable[[Any, Any], tuple[jax.Array, Metrics]],
+    params: Any,
+    state: optax.OptState,
+    batch: Any,
+    config: OptimiserConfig,
+    progress: jax.Array,
+) -> tuple[Any, optax.OptState, Metrics]:
+    """Epochs of minibatch steps over the leading axis of ``batch``, shuffled anew for each.
+
+    Args:
+        key: consumed.
+        loss: ``(params, minibatch) -> (loss, metrics)``.
+        params: what is trained.
+        state: of the optimiser.
+        batch: pytree, one leading axis.
+        config: rate, epochs, minibatches.
+        progress: float32 ``[]``, share of the training that is done.
+
+    Returns:
+        Parameters, the optimiser's state, and means of the metrics over the steps.
+
+    Raises:
+        ValueError: if the rows do not divide into the minibatches.
+    """
+    size = jax.tree.leaves(batch)[0].shape[0]
+    if size % config.minibatches:
+        raise ValueError(f"{size} rows do not divide into {config.minibatches} minibatches")
+    transform = optimiser(config)
+    rate = annealed(config.learning_rate, config.final_learning_rate, progress)
+    shuffled = jnp.argsort(jax.random.bits(key, (config.epochs, size)), axis=-1)
+
+    def step(carry: tuple[Any, Any], rows: jax.Array) -> tuple[tuple[Any, Any], Metrics]:
+        sample = jax.tree.map(lambda x: x[rows], batch)
+        params, state, metrics = gradient_step(lambda p: loss(p, sample), *carry, transform, rate)
+        return (params, state), metrics
+
+    rows = shuffled.reshape(config.epochs * config.minibatches, -1)
+    (params, state), metrics = jax.lax.scan(step, (params, state), rows)
+    return params, state, jax.tree.map(jnp.mean, metrics)

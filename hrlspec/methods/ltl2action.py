@@ -1,0 +1,70 @@
+"""The baseline LTL2Action: one flat policy that is told the whole remaining task (Vaezipoor et al., 2021).
+
+Relabelling and curriculum as the paper grants them. Axes: **B** environments of a batch, **N** tree nodes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from hrlspec.agent.distributions import MASKED
+from hrlspec.agent.experience import View
+from hrlspec.agent.high_level import Choice, HighLevel
+from hrlspec.agent.low_level import LowLevel, Params
+from hrlspec.agent.method import Method
+from hrlspec.agent.networks.controller import Instruction, Sees
+from hrlspec.config import Checked, Config, NetworkConfig
+from hrlspec.spec import TaskState, TaskTree, open_edges
+
+
+@dataclasses.dataclass(frozen=True)
+class NoChoice(Checked, HighLevel):
+    """Assigns nothing: the policy may take any edge. V^h is the value of the one policy there is."""
+
+    def init(self, key: jax.Array, low: LowLevel, view: View, tree: TaskTree) -> Any:
+        """Nothing is learned."""
+        del key, low, view, tree
+        return {}
+
+    def choose(
+        self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
+    ) -> Choice:
+        """The root, which is no edge."""
+        feasible = jax.vmap(open_edges)(tree, state)
+        root = jnp.arange(tree.num_nodes) == TaskTree.ROOT
+        logits = jnp.where(root, jnp.zeros(feasible.shape), MASKED)
+        value = low.value_of(params, view, told, logits.argmax(-1), feasible)
+        return Choice(logits, value, jnp.zeros(logits.shape), told.ahead)
+
+
+@dataclasses.dataclass(frozen=True)
+class LTL2Action(Method):
+    """One flat policy, conditioned on the whole remaining task."""
+
+    high: NoChoice = NoChoice()
+
+    name: ClassVar[str] = "ltl2action"
+    about: ClassVar[str] = "one flat policy sees the whole remaining task"
+    sees: ClassVar[Sees] = "whole task"
+
+    def configure(self, config: Config) -> Config:
+        """No sub-task, so no roles to see the world by, and no proposition that a shield could know to avoid."""
+        network = dataclasses.replace(
+            config.network,
+            # All that it knows of the task goes through these.
+            task_features=NetworkConfig.task_features,
+            task_rounds=0,
+            roles=False,
+            names=False,
+            memory=0,
+            symmetric=False,
+        )
+        shield = dataclasses.replace(config.shield, enabled=False)
+        return dataclasses.replace(config, network=network, shield=shield)
+
+
+LTL2ACTION = LTL2Action()

@@ -1,0 +1,89 @@
+"""A preset is one value: everything that a world needs to be trained, evaluated and drawn."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+
+from envs_jax import Environment
+from hrlspec.agent.method import Method
+from hrlspec.config import Config, evolve
+from hrlspec.methods import METHODS, ImplicitPlanner
+from hrlspec.presets.recipes import Recipe, RewardSet, Settings, recipe, with_bonuses
+from hrlspec.tasks.rewards import Bonus, RewardMachine, reward_machine
+
+Fit = Callable[[Settings, Recipe], Settings]
+
+
+def _as_it_is(settings: Settings, recipe: Recipe) -> Settings:
+    del recipe
+    return settings
+
+
+@dataclasses.dataclass(frozen=True)
+class Preset:
+    """A world with its settings.
+
+    Attributes:
+        name: as flags and run folders know it.
+        make: the environment.
+        fit: a recipe's settings fitted to the world.
+        fit_bonuses: the same, besides, under reward set 2.
+        bonuses: order bonuses of reward set 2 (paper, "Reward Function of Subgoals").
+        learning_rates: where a method's tuning chose another one than its recipe's, by recipe and method: the trial
+            with the largest sum of the learning curve's mean and the final return (``reproduce --only walk-tuning`` and
+            its like).
+        quick_compile: whether programs run as fast when XLA spends little time on them; true where matrix products
+            are most of the arithmetic, which are not compiled.
+    """
+
+    name: str
+    make: Callable[[], Environment]
+    fit: Fit = _as_it_is
+    fit_bonuses: Fit = _as_it_is
+    bonuses: tuple[Bonus, ...] = ()
+    learning_rates: Mapping[tuple[Recipe, str], float] = dataclasses.field(default_factory=dict)
+    quick_compile: bool = False
+
+    def settings(
+        self, method: str | Method = "ours", recipe_name: Recipe = "hrlspec", reward_set: RewardSet = 1
+    ) -> tuple[Config, Method]:
+        """The settings of a run unless told otherwise.
+
+        Args:
+            method: by name, with the planner's settings as the recipe has them; or a value, whose settings stay.
+            recipe_name: ``paper``, the paper's method fitted to the world, or ``hrlspec``, what measured better.
+            reward_set: 1 or 2.
+
+        Raises:
+            ValueError: there is no such method.
+        """
+        settings = self.fit(recipe(recipe_name), recipe_name)
+        if reward_set == 2:
+            settings = self.fit_bonuses(with_bonuses(settings, recipe_name), recipe_name)
+        chosen = method if isinstance(method, Method) else named_method(method)
+        if chosen is not method and isinstance(chosen.high, ImplicitPlanner):
+            chosen = dataclasses.replace(chosen, high=settings.planner)
+        config = chosen.configure(settings.config)
+        # An ablation is ours but for one thing.
+        tuned = "ours" if isinstance(chosen.high, ImplicitPlanner) else chosen.name
+        rate = self.learning_rates.get((recipe_name, tuned), config.low.optimiser.learning_rate)
+        return evolve(config, {"low.optimiser.learning_rate": rate}), chosen
+
+    def rewards(self, reward_set: RewardSet = 1) -> RewardMachine:
+        """The rewards of a reward set: 1 for completion; in set 2 also for sub-tasks and for orders of letters."""
+        propositions = self.make().propositions
+        if reward_set == 1:
+            return reward_machine(propositions)
+        return reward_machine(propositions, subtask=1.0, bonuses=self.bonuses)
+
+
+def named_method(name: str) -> Method:
+    """A method of `hrlspec.methods` by its name.
+
+    Raises:
+        ValueError: there is none; the message lists those there are.
+    """
+    if name not in METHODS:
+        raise ValueError(f"unknown method {name!r}, expected one of: {', '.join(METHODS)}")
+    return METHODS[name]

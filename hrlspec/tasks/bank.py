@@ -1,0 +1,53 @@
+"""Banks of training tasks, drawn anew as training goes on.
+
+Axes: **L** levels, **M** tasks per level.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hrlspec.config import CurriculumConfig
+from hrlspec.spec import TaskTree
+from hrlspec.tasks.curriculum import draw_bank
+
+ITERATIONS_PER_BANK = 16
+"""Iterations that a bank serves."""
+
+
+class TaskBanks:
+    """The banks of a run. A bank depends on the seed and its number alone, so that a resumed run draws the same ones.
+
+    Args:
+        seed: 0 or more.
+        config: what the tasks are like.
+        num_propositions: P.
+        reserved: uint32, hashes of held-out tasks, which are never drawn.
+
+    Raises:
+        ValueError: no such task can be drawn.
+    """
+
+    def __init__(self, seed: int, config: CurriculumConfig, num_propositions: int, reserved: np.ndarray) -> None:
+        self._seed, self._config, self._num_propositions = seed, config, num_propositions
+        self._reserved = reserved
+        self._latest = 0, self._draw(0)
+
+    def at(self, iteration: int) -> TaskTree:
+        """The bank of an iteration, on the device: L·M tasks, level by level."""
+        number = iteration // ITERATIONS_PER_BANK
+        if self._latest[0] != number:
+            self._latest = number, self._draw(number)
+        return self._latest[1]
+
+    def _draw(self, number: int) -> TaskTree:
+        rng = np.random.default_rng([self._seed, number])
+        bank: TaskTree = jax.tree.map(jnp.asarray, draw_bank(rng, self._config, self._num_propositions, self._reserved))
+        return bank
+
+
+def seed_of(key: jax.Array) -> int:
+    """The number that a key was made of, or one as good: ``seed_of(jax.random.key(7)) == 7``."""
+    return int.from_bytes(np.asarray(jax.random.key_data(key)).astype(">u4").tobytes(), "big")
