@@ -7,7 +7,7 @@ mode. Axes: **A** actions, or components of an action; **K** candidate actions.
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ MOST_MEAN = 1.5
 have acted otherwise: the gradient of its log-likelihood grows with the distance of the means over the variance."""
 
 
+@runtime_checkable
 class Distribution(Protocol):
     """A family of distributions over one environment's actions."""
 

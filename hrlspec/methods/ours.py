@@ -68,17 +68,21 @@ class ImplicitPlanner(Checked, HighLevel):
         what = "planner samples (num_envs * num_steps / steps_per_sample)"
         check_divides("ImplicitPlanner.ppo.optimiser.minibatches", self.ppo.optimiser, self.num_samples(config), what)
 
+    def planner(self, low: LowLevel) -> Planner:
+        """The networks; a subclass that gives others of the same methods plans with them."""
+        return Planner(self.network, low.config.network)
+
     def init(self, key: jax.Array, low: LowLevel, view: View, tree: TaskTree) -> Any:
         """See :class:`HighLevel`."""
         state = TaskState(jnp.int32(0), jnp.zeros(tree.num_nodes, bool), jnp.int32(0))
-        return self._planner(low).init(key, view, tree, state, jnp.zeros(tree.num_nodes))
+        return self.planner(low).init(key, view, tree, state, jnp.zeros(tree.num_nodes))
 
     def choose(
         self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
     ) -> Choice:
         """See :class:`HighLevel`."""
         advice, ahead = self.advise(low, params, view, tree, state, told)
-        plan = jax.vmap(self._planner(low).apply, in_axes=(None, 0, 0, 0, 0))
+        plan = jax.vmap(self.planner(low).apply, in_axes=(None, 0, 0, 0, 0))
         logits, value = cast("tuple[jax.Array, jax.Array]", plan(params["high"], view, tree, state, advice))
         return Choice(logits, value, advice, ahead)
 
@@ -134,7 +138,7 @@ class ImplicitPlanner(Checked, HighLevel):
 
     def loss(self, low: LowLevel, params: Any, batch: HighBatch, progress: jax.Array) -> tuple[jax.Array, Metrics]:
         """PPO and TransE loss on a minibatch ``[B]`` (eqs. 4 and 5)."""
-        planner = self._planner(low)
+        planner = self.planner(low)
         decision = batch.decision
         logits, value = cast(
             "tuple[jax.Array, jax.Array]",
@@ -173,9 +177,6 @@ class ImplicitPlanner(Checked, HighLevel):
         margin = jnp.maximum(0.0, self.transe_margin - other)
         both = valid & jnp.roll(valid, 1)
         return ppo.masked_mean(error, valid & batch.completed) + ppo.masked_mean(margin, both)
-
-    def _planner(self, low: LowLevel) -> Planner:
-        return Planner(self.network, low.config.network)
 
     def _paths(
         self, low: LowLevel, tree: TaskTree, state: TaskState, told: Instruction

@@ -6,10 +6,11 @@ shows where it differs from the existential semantics of :func:`hrlspec.spec.sat
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Bool, Int32
 
+from envs_jax.arrays import Array
 from hrlspec.spec.tree import TaskTree
 
 RUNNING = 0
@@ -27,9 +28,9 @@ class TaskState:
         status: int32 ``[]``, ``RUNNING``, ``SATISFIED`` or ``VIOLATED``.
     """
 
-    node: jax.Array  # int32 []
-    blocked: jax.Array  # bool [N]
-    status: jax.Array  # int32 []
+    node: Int32[Array, "*lead"]
+    blocked: Bool[Array, "*lead N"]
+    status: Int32[Array, "*lead"]
 
 
 def initial(tree: TaskTree) -> TaskState:
@@ -41,12 +42,12 @@ def initial(tree: TaskTree) -> TaskState:
     )
 
 
-def open_edges(tree: TaskTree, state: TaskState) -> jax.Array:
+def open_edges(tree: TaskTree, state: TaskState) -> Bool[Array, " N"]:
     """Feasible sub-tasks, bool ``[N]``: the unblocked edges out of the current node."""
     return tree.valid & (tree.parent == state.node) & ~state.blocked
 
 
-def advance(tree: TaskTree, state: TaskState, labels: jax.Array, assigned: jax.Array | int) -> TaskState:
+def advance(tree: TaskTree, state: TaskState, labels: Bool[Array, " P"], assigned: Int32[Array, ""] | int) -> TaskState:
     """One step of the monitor on the labels that hold in the new environment state.
 
     Open edges whose ``avoid`` is hit become blocked; then at most one open edge whose ``reach`` holds is

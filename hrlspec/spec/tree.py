@@ -7,9 +7,11 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Bool, Int32
+
+from envs_jax.arrays import Array
 
 
 @struct.dataclass
@@ -32,12 +34,12 @@ class TaskTree:
     NO_NODE: ClassVar[int] = -1
     ROOT: ClassVar[int] = 0
 
-    parent: jax.Array  # int32 [N]
-    reach: jax.Array  # bool [N, P]
-    avoid: jax.Array  # bool [N, P]
-    accepting: jax.Array  # bool [N]
-    valid: jax.Array  # bool [N]
-    depth: jax.Array  # int32 [N]
+    parent: Int32[Array, "*lead N"]
+    reach: Bool[Array, "*lead N P"]
+    avoid: Bool[Array, "*lead N P"]
+    accepting: Bool[Array, "*lead N"]
+    valid: Bool[Array, "*lead N"]
+    depth: Int32[Array, "*lead N"]
 
     @property
     def num_nodes(self) -> int:
@@ -50,12 +52,12 @@ class TaskTree:
         return self.reach.shape[-1]
 
     @property
-    def edges(self) -> jax.Array:
+    def edges(self) -> Bool[Array, "*lead N"]:
         """Which nodes are entered by an edge, bool ``[..., N]``: all valid ones but the root."""
         return self.valid & (self.parent >= 0)
 
 
-def subtask_avoid(tree: TaskTree) -> jax.Array:
+def subtask_avoid(tree: TaskTree) -> Bool[Array, "N P"]:
     """What each sub-task must avoid, bool ``[N, P]`` (eq. 2): own avoid, and what siblings reach, minus own reach.
 
     For siblings that reach conjunctions this forbids more than eq. (2) does: ¬(b∧c) becomes ¬b and ¬c.

@@ -1,0 +1,69 @@
+"""Shapes and types of all functions and structs of the packages, checked while tests run.
+
+``install()`` must come before the packages are imported. A function is checked whenever it is called or traced. A struct
+is checked where our own code makes one: JAX makes them too, around whatever stands for a leaf.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import sys
+from typing import Any
+
+import flax.struct
+import jax
+import jaxtyping
+import numpy as np
+from beartype import BeartypeConf, beartype
+from beartype.door import is_bearable
+
+PACKAGES = ("envs_jax", "hrlspec")
+
+checked = beartype(conf=BeartypeConf(is_pep484_tower=True))
+
+
+def install() -> None:
+    """Checks all that is imported of the packages from now on."""
+    jaxtyping.install_import_hook(list(PACKAGES), f"{__name__}.checked")
+    flax.struct.dataclass = _checked_struct(flax.struct.dataclass)
+
+
+def _checked_struct(decorate: Any) -> Any:
+    @functools.wraps(decorate)
+    def struct(cls: Any = None, **options: Any) -> Any:
+        if cls is None:
+            return functools.partial(struct, **options)
+        made = decorate(cls, **options)
+        if not made.__module__.startswith(PACKAGES):
+            return made
+        made.__no_type_check__ = True  # by jaxtyping, which would refuse what JAX makes
+        init = made.__init__
+
+        @functools.wraps(init)
+        def checked_init(self: Any, *args: Any, **kwargs: Any) -> None:
+            init(self, *args, **kwargs)
+            if sys._getframe(1).f_globals.get("__name__", "").startswith((*PACKAGES, "dataclasses")):
+                check(self)
+
+        made.__init__ = checked_init
+        return made
+
+    return struct
+
+
+def check(struct: Any) -> None:
+    """Raises ``TypeError`` unless the fields of a struct that hold arrays have the shapes and types it says."""
+    with jaxtyping.jaxtyped("context"):
+        for name, hint in _hints(type(struct)).items():
+            value = getattr(struct, name)
+            if isinstance(value, jax.Array | np.ndarray) and not is_bearable(value, hint):
+                found = f"{value.dtype}{list(value.shape)}"
+                raise TypeError(f"{type(struct).__name__}.{name} is {found}, expected {hint}")
+
+
+@functools.cache
+def _hints(cls: type) -> dict[str, Any]:
+    """Types of the fields; `typing.get_type_hints` gives none of a class that is not to be checked."""
+    names = vars(sys.modules[cls.__module__])
+    return {field.name: eval(str(field.type), names) for field in dataclasses.fields(cls)}
