@@ -145,7 +145,8 @@ class Letter(Symmetric, FiniteGraph, ContestedLayouts):
 
         Args:
             key: consumed.
-            first, second: bool ``[P]``, the letter wanted first, and second; if either is empty any layout will do.
+            first: bool ``[P]``, the letter wanted first; if it is empty any layout will do.
+            second: bool ``[P]``, the letter wanted after it; likewise.
             params: unused here.
         """
         layout_key, pair_key = jax.random.split(key)

@@ -79,7 +79,9 @@ def high_level_targets(
     the rollout is bootstrapped with V^h of the state reached, and goes on in the next one.
 
     Args:
-        reward, terminated, truncated: as for :func:`low_level_targets`.
+        reward: float32 ``[T, E]``, as for :func:`low_level_targets`.
+        terminated: bool ``[T, E]``, likewise.
+        truncated: bool ``[T, E]``, likewise.
         decided: bool ``[T, E]``, a decision was made at t.
         value: float32 ``[T, E]``, V^h at t; read where ``decided``.
         bootstrap: float32 ``[T, E]``, V^h of the state after t; read where truncated and at T - 1.
