@@ -162,12 +162,6 @@ class Environment(abc.ABC):
     def action_space(self) -> Discrete | Box:
         """Where actions lie."""
 
-    # Read of every environment until agents ask for Symmetric.
-    @property
-    def symmetries(self) -> Symmetries | Reflections | None:
-        """See :class:`Symmetric`."""
-        return None
-
     @property
     def num_propositions(self) -> int:
         """P."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from hrlspec.evaluation.aggregate import Aggregate, aggregate
-from hrlspec.evaluation.cases import BranchCases, Cases, is_finite, make_branch_cases, make_cases
+from hrlspec.evaluation.cases import BranchCases, Cases, make_branch_cases, make_cases
 from hrlspec.evaluation.protocol import (
     ChoiceEvaluation,
     ReturnEvaluation,
@@ -34,7 +34,6 @@ __all__ = [
     "choice_evaluation",
     "evaluate_suite",
     "final_evaluation",
-    "is_finite",
     "make_branch_cases",
     "make_cases",
     "periodic_evaluation",

@@ -9,23 +9,22 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
 
 import jax
 import numpy as np
 
+from envs_jax import Environment, FiniteGraph
+from envs_jax.base import Layout
 from hrlspec.evaluation.suite import Suite
-from hrlspec.exact import solver
-from hrlspec.exact.reference_agents import branch_scores, myopic_steps
-from hrlspec.exact.shortest_path import has_grid, planned_steps
+from hrlspec.exact.reference_agents import branch_scores
 from hrlspec.exact.solver import tabulate
+from hrlspec.exact.steps import Steps, step_solver
 from hrlspec.spec import TaskTree
 from hrlspec.tasks.rewards import RewardMachine
 
 LAYOUTS_PER_TASK = 10
 MOST_ROUNDS = 20
 """Draws of ``layouts_per_task`` layouts for a task before it is taken to be impossible (or nearly)."""
-
 
 BLOCK = 512
 """Layouts drawn at a time, so that one compiled program serves all suites."""
@@ -49,7 +48,7 @@ class Cases:
 
     suite: Suite
     task: np.ndarray
-    layouts: Any
+    layouts: Layout
     optimum: np.ndarray | None
     myopic: np.ndarray | None
     excluded: int
@@ -81,7 +80,7 @@ class BranchCases:
 
     suite: Suite
     task: np.ndarray
-    layouts: Any
+    layouts: Layout
     optimum: np.ndarray
     random: np.ndarray
     longest: np.ndarray
@@ -98,13 +97,8 @@ class BranchCases:
         return trees
 
 
-def is_finite(env: Any) -> bool:
-    """Whether the environment is a finite labelled graph, so that optima are known."""
-    return hasattr(env, "transition_table")
-
-
 def make_cases(
-    env: Any, suite: Suite, *, layouts_per_task: int = LAYOUTS_PER_TASK, seed: int = 0, optima: bool = True
+    env: Environment, suite: Suite, *, layouts_per_task: int = LAYOUTS_PER_TASK, seed: int = 0, optima: bool = True
 ) -> Cases:
     """Draws layouts for each task of a suite and solves them.
 
@@ -122,53 +116,43 @@ def make_cases(
     Raises:
         ValueError: if a task cannot be satisfied in (nearly) any layout.
     """
-    solve = optima and (is_finite(env) or has_grid(env))
-    kept: list[list[tuple[Any, float, float]]] = [[] for _ in range(len(suite))]
-    excluded = 0
+    kept: list[list[tuple[Layout, float, float]]] = [[] for _ in range(len(suite))]
+    excluded, solved = 0, False
     for draw in range(MOST_ROUNDS):
         wanting = [row for row in range(len(suite)) if len(kept[row]) < layouts_per_task]
         if not wanting:
             break
         pool = draw_layouts(env, suite, layouts_per_task, seed=seed, draw=draw)
-        graph = tabulate(env, pool) if optima and is_finite(env) else None
+        solve = step_solver(env, pool) if optima else None
+        solved = solve is not None
         for row in wanting:
-            cells = range(row * layouts_per_task, (row + 1) * layouts_per_task)
-            if graph is not None:
-                part, tree = graph[cells.start : cells.stop], task_of(suite, row)
-                optimum, myopic = solver.optimal_steps(part, tree), myopic_steps(part, tree)
-            elif solve:
-                some = jax.tree.map(lambda x, cells=cells: x[cells.start : cells.stop], pool)
-                optimum, myopic = planned_steps(env, some, task_of(suite, row))
-            else:
-                optimum = myopic = np.zeros(layouts_per_task, np.float32)
-            possible = optimum <= env.horizon
-            excluded += int((~possible).sum())
-            fresh = [
-                (jax.tree.map(lambda x, cell=cell: x[cell], pool), optimum[i], myopic[i])
-                for i, cell in enumerate(cells)
-                if possible[i]
-            ]
-            kept[row] += fresh[: layouts_per_task - len(kept[row])]
+            rows = slice(row * layouts_per_task, (row + 1) * layouts_per_task)
+            zeros = np.zeros(layouts_per_task, np.float32)
+            steps = Steps(zeros, zeros) if solve is None else solve(rows, task_of(suite, row))
+            possible = np.flatnonzero(steps.optimum <= env.horizon)
+            excluded += layouts_per_task - len(possible)
+            for i in possible[: layouts_per_task - len(kept[row])]:
+                layout = jax.tree.map(lambda x, at=rows.start + i: x[at], pool)
+                kept[row].append((layout, steps.optimum[i], steps.myopic[i]))
     for row, found in enumerate(kept):
         if len(found) < layouts_per_task:
             raise ValueError(
                 f"task {suite.formulas[row]!r} can be satisfied within {env.horizon} steps in only {len(found)} of "
                 f"{layouts_per_task * MOST_ROUNDS} layouts of {env.name}, expected at least {layouts_per_task}"
             )
-    flat = [case for found in kept for case in found]
-    layouts = jax.tree.map(lambda *leaves: np.stack(leaves), *[case[0] for case in flat])
+    layouts, optimum, myopic = zip(*[case for found in kept for case in found], strict=True)
     return Cases(
         suite=suite,
         task=np.repeat(np.arange(len(suite)), layouts_per_task),
-        layouts=layouts,
-        optimum=np.array([case[1] for case in flat], np.float32) if solve else None,
-        myopic=np.array([case[2] for case in flat], np.float32) if solve else None,
+        layouts=jax.tree.map(lambda *leaves: np.stack(leaves), *layouts),
+        optimum=np.array(optimum, np.float32) if solved else None,
+        myopic=np.array(myopic, np.float32) if solved else None,
         excluded=excluded,
     )
 
 
 def make_branch_cases(
-    env: Any,
+    env: Environment,
     suite: Suite,
     machine: RewardMachine,
     *,
@@ -181,7 +165,7 @@ def make_branch_cases(
     Unlike :func:`make_cases` it draws no others: in how many layouts the branch matters is the task's nature.
 
     Args:
-        env: a finite environment.
+        env: a :class:`envs_jax.FiniteGraph`.
         suite: the tasks.
         machine: the rewards.
         layouts_per_task: layouts drawn for each task.
@@ -191,7 +175,7 @@ def make_branch_cases(
     Raises:
         ValueError: if the environment has no exact solver or no case is left.
     """
-    if not is_finite(env):
+    if not isinstance(env, FiniteGraph):
         raise ValueError(f"{env.name} has no exact solver, so return over optimum is not known")
     pool = draw_layouts(env, suite, layouts_per_task, seed=seed)
     graph = tabulate(env, pool)
@@ -225,7 +209,7 @@ def task_of(suite: Suite, row: int) -> TaskTree:
     return tree
 
 
-def draw_layouts(env: Any, suite: Suite, layouts_per_task: int, *, seed: int = 0, draw: int = 0) -> Any:
+def draw_layouts(env: Environment, suite: Suite, layouts_per_task: int, *, seed: int = 0, draw: int = 0) -> Layout:
     """Layouts for each task in turn, numpy leaves with leading axis M · ``layouts_per_task``."""
     count = np.arange(draw * layouts_per_task, (draw + 1) * layouts_per_task, dtype=np.uint32)
     hashes, counts = np.repeat(suite.hashes, layouts_per_task), np.tile(count, len(suite))
@@ -237,10 +221,10 @@ def draw_layouts(env: Any, suite: Suite, layouts_per_task: int, *, seed: int = 0
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _layouts(env: Any, key: jax.Array, hashes: jax.Array, counts: jax.Array) -> Any:
+def _layouts(env: Environment, key: jax.Array, hashes: jax.Array, counts: jax.Array) -> Layout:
     """A layout for each pair of a task's hash and a number, leading axis ``BLOCK``."""
 
-    def one(task: jax.Array, number: jax.Array) -> Any:
+    def one(task: jax.Array, number: jax.Array) -> Layout:
         return env.sample_layout(jax.random.fold_in(jax.random.fold_in(key, task), number), env.default_params)
 
     return jax.vmap(one)(hashes, counts)

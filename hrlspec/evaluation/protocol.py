@@ -9,18 +9,19 @@ Axes: **M** tasks, **B** episodes.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import jax
 import numpy as np
 
-from hrlspec.agent.agent import Agent, Params
+from envs_jax import Environment
+from hrlspec.agent.agent import Agent
+from hrlspec.agent.low_level import Params
 from hrlspec.evaluation.cases import LAYOUTS_PER_TASK, BranchCases, Cases, make_branch_cases, make_cases
 from hrlspec.evaluation.episodes import run_episodes, trace_episodes
 from hrlspec.evaluation.results import ChoiceResult, ReturnResult, SuiteResult
 from hrlspec.evaluation.scoring import score_choices, score_returns, score_suite
 from hrlspec.evaluation.suite import Suite
-from hrlspec.exact.contested import ContestedSuite, contested_suite
+from hrlspec.exact.contested import ContestedSuite, chosen_instances, contested_suite
 from hrlspec.spec import TaskTree
 from hrlspec.tasks.rewards import RewardMachine
 
@@ -103,11 +104,7 @@ class ChoiceEvaluation:
         # Entry t of a trace is the state before step t, so the first one away from the root is where the edge led.
         away = trace.running & (trace.node != TaskTree.ROOT)
         there = jax.tree.map(lambda x: x[away.argmax(0), np.arange(x.shape[1])], trace.env_state)
-        env: Any = agent.env
-        if hasattr(env, "graph_state"):
-            place = np.asarray(jax.vmap(env.graph_state)(there))
-        else:
-            place = np.asarray(jax.vmap(env.instance_at)(there, suite.tasks.reach[:, 1]))
+        place = chosen_instances(agent.env, there, np.asarray(suite.tasks.reach[:, 1]))
         return score_choices(suite, episodes.success, np.where(away.any(0), place, -1), greedy=self.greedy)
 
 
@@ -146,7 +143,7 @@ def evaluate_suite(
 
 
 def periodic_evaluation(
-    env: Any, suite: Suite, *, num_tasks: int = 10, episodes: int = 100, seed: int = 0, greedy: bool = False
+    env: Environment, suite: Suite, *, num_tasks: int = 10, episodes: int = 100, seed: int = 0, greedy: bool = False
 ) -> SuiteEvaluation:
     """The paper's evaluation during training: 10 random unseen tasks, 100 episodes in all.
 
@@ -170,7 +167,7 @@ def periodic_evaluation(
 
 
 def final_evaluation(
-    env: Any, suite: Suite, *, episodes: int = 1000, seed: int = 1, greedy: bool = False, shield: bool = False
+    env: Environment, suite: Suite, *, episodes: int = 1000, seed: int = 1, greedy: bool = False, shield: bool = False
 ) -> SuiteEvaluation:
     """The evaluation at the end of training: all tasks, ten layouts or more for each, at least ``episodes`` in all.
 
@@ -187,7 +184,7 @@ def final_evaluation(
 
 
 def return_evaluation(
-    env: Any,
+    env: Environment,
     suite: Suite,
     machine: RewardMachine,
     *,
@@ -195,14 +192,24 @@ def return_evaluation(
     seed: int = 1,
     greedy: bool = False,
 ) -> ReturnEvaluation:
-    """Return over optimum on the tasks and layouts of a suite in which the branch matters; for finite environments."""
+    """Return over optimum on the tasks and layouts of a suite in which the branch matters.
+
+    Raises:
+        ValueError: if the environment is no :class:`envs_jax.FiniteGraph`, or the branch matters nowhere.
+    """
     cases = make_branch_cases(env, suite, machine, layouts_per_task=layouts_per_task, seed=seed)
     return ReturnEvaluation(cases, greedy)
 
 
-def choice_evaluation(env: Any, *, num_cases: int = 400, seed: int = 1, greedy: bool = False) -> ChoiceEvaluation:
-    """Contested choice on ``num_cases`` layouts, half of them controls; for environments that ``can_contest``."""
-    return ChoiceEvaluation(contested_suite(env, jax.random.key(seed), num_cases=num_cases), greedy)
+def choice_evaluation(
+    env: Environment, *, num_cases: int = 400, seed: int = 1, greedy: bool = False
+) -> ChoiceEvaluation:
+    """Contested choice on ``num_cases`` layouts, half of them controls.
+
+    Raises:
+        ValueError: if the environment is not ``hrlspec.exact.contested.Contestable``.
+    """
+    return ChoiceEvaluation(contested_suite(jax.random.key(seed), env, num_cases=num_cases), greedy)
 
 
 def _even(total: int, most: int) -> int:

@@ -15,7 +15,7 @@ from hrlspec.evaluation.stats import Interval
 ESTIMATES = ("success_rate", "violation_rate", "return_mean", "steps_mean", "spl")
 """The estimates of a :class:`Score`; each has ``<name>_interval`` beside it in JSON."""
 
-_YARDSTICKS = ("optimal_steps_mean", "myopic_success_rate", "myopic_spl")
+_REFERENCES = ("optimal_steps_mean", "myopic_success_rate", "myopic_spl")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Score:
         result: dict[str, Any] = {"episodes": self.episodes}
         for name in ESTIMATES:
             result |= interval_to_json(name, getattr(self, name))
-        return result | {name: getattr(self, name) for name in _YARDSTICKS}
+        return result | {name: getattr(self, name) for name in _REFERENCES}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Score:
@@ -61,7 +61,7 @@ class Score:
             estimates["spl"] = None
         return cls(
             episodes=data["episodes"],
-            **{name: data[name] for name in _YARDSTICKS},
+            **{name: data[name] for name in _REFERENCES},
             **estimates,
         )
 

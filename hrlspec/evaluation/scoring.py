@@ -49,7 +49,7 @@ def score_suite(cases: Cases, episodes: Episodes, *, horizon: int, greedy: bool,
 
 
 def score_returns(cases: BranchCases, episodes: Episodes, *, greedy: bool) -> ReturnResult:
-    """Return over optimum of one episode per case, and what the yardsticks get on the same cases."""
+    """Return over optimum of one episode per case, and what the reference agents get on the same cases."""
     ratio = np.asarray(episodes.returns) / cases.optimum
     depth = cases.suite.depths[cases.task]
     return ReturnResult(
@@ -76,7 +76,7 @@ def score_choices(suite: ContestedSuite, success: np.ndarray, place: np.ndarray,
     """
     right = suite.right[np.arange(len(place)), np.maximum(place, 0)] & (place >= 0) & success
     contested, controls = (rate_interval(right[suite.contested == side]) for side in (True, False))
-    # Two independent samples: half the hypotenuse of their distances to the bounds (Newcombe's way with Wilson's).
+    # Two independent samples: half the hypotenuse of their distances to the bounds (Newcombe's method with Wilson's).
     centre = (contested.estimate + controls.estimate) / 2
     below = np.hypot(contested.estimate - contested.low, controls.estimate - controls.low) / 2
     above = np.hypot(contested.high - contested.estimate, controls.high - controls.estimate) / 2

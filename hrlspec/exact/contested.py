@@ -1,6 +1,6 @@
 """Contested choices: layouts where going to the nearest goal first costs steps later.
 
-The tasks are two sub-tasks in sequence, ``achieve a; achieve b``. Where the nearest a leads to a longer way in all,
+The tasks are two sub-tasks in sequence, ``achieve a; achieve b``. Where the nearest a leads to a longer path in all,
 only an agent that looks ahead passes it by; in the mirrored controls the nearest a is the right one.
 
 Axes: **L** layouts, **S** graph states, **N** tree nodes, **P** atomic propositions, **Q** cases of a suite.
@@ -13,11 +13,17 @@ import itertools
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from envs_jax import ContestedChoice, Environment, FiniteGraph
+from envs_jax.base import Layout, State
 from hrlspec.exact.automaton import Automaton
 from hrlspec.exact.solver import Graph, product, steps_table, tabulate
 from hrlspec.spec.tree import TaskTree
+
+Contestable = FiniteGraph | ContestedChoice
+"""Environments in which it is known which instance of the first goal is the right one; ask with ``isinstance``."""
 
 
 class FirstVisits(NamedTuple):
@@ -65,7 +71,7 @@ class ContestedSuite(NamedTuple):
         optimum: float32 ``[Q]``, least steps to satisfaction, nan where they are not known.
     """
 
-    layouts: Any
+    layouts: Layout
     tasks: TaskTree
     contested: np.ndarray
     right: np.ndarray
@@ -73,25 +79,17 @@ class ContestedSuite(NamedTuple):
     optimum: np.ndarray
 
 
-def can_contest(env: Any) -> bool:
-    """Whether an environment has contested layouts to evaluate on."""
-    return hasattr(env, "transition_table") or hasattr(env, "instance_at")
-
-
-def two_step_task(first: int, second: int, num_propositions: int, num_nodes: int = 3) -> TaskTree:
-    """``achieve first; achieve second``, padded to ``num_nodes`` (numpy leaves)."""
-    if num_nodes < 3:
-        raise ValueError(f"num_nodes is {num_nodes}, expected at least 3: a root and two sub-tasks")
-    reach = np.zeros((num_nodes, num_propositions), bool)
+def two_step_task(first: int, second: int, num_propositions: int) -> TaskTree:
+    """``achieve first; achieve second`` (numpy leaves, N = 3)."""
+    reach = np.zeros((3, num_propositions), bool)
     reach[1, first] = reach[2, second] = True
-    index = np.arange(num_nodes)
     leaves: dict[str, Any] = {
-        "parent": np.where((index == 1) | (index == 2), index - 1, TaskTree.NO_NODE).astype(np.int32),
+        "parent": np.array([TaskTree.NO_NODE, 0, 1], np.int32),
         "reach": reach,
         "avoid": np.zeros_like(reach),
-        "accepting": index == 2,
-        "valid": index < 3,
-        "depth": np.where(index < 3, index, 0).astype(np.int32),
+        "accepting": np.array([False, False, True]),
+        "valid": np.ones(3, bool),
+        "depth": np.arange(3, dtype=np.int32),
     }
     return TaskTree(**leaves)
 
@@ -125,7 +123,7 @@ def first_visits(graph: Graph, tree: TaskTree) -> FirstVisits:
         np.minimum.at(total, at, time + remaining[(*at, state[taken])])
         fresh = ~taken & (state != Automaton.VIOLATED) & ~seen[layout, place, state]
         seen[layout[fresh], place[fresh], state[fresh]] = True
-        # Of several ways to the same place at the same time, one goes on.
+        # Of several paths to the same place at the same time, one goes on.
         keys = np.ravel_multi_index((layout[fresh], place[fresh], state[fresh]), seen.shape)
         layout, place, state = np.unravel_index(np.unique(keys), seen.shape)
     return FirstVisits(steps, total)
@@ -159,46 +157,67 @@ def find_contested(graph: Graph, tree: TaskTree, *, margin: int = 2) -> Conteste
 
 
 def contested_suite(
-    env: Any,
-    key: jax.Array,
-    *,
-    num_cases: int,
-    margin: int = 2,
-    max_nodes: int = 3,
-    params: Any = None,
-    most_rounds: int = 200,
+    key: jax.Array, env: Environment, *, num_cases: int, margin: int = 2, most_rounds: int = 200
 ) -> ContestedSuite:
-    """Draws layouts of an environment until there are enough contested ones and as many controls.
+    """Contested layouts of an environment, and as many controls.
 
-    Tasks go through all ordered pairs of different propositions in turn. Layouts are the environment's own; a case
-    is kept for the reason above alone, so the suite is a random sample of such layouts.
+    Tasks go through all ordered pairs of different propositions in turn. In finite environments the layouts are those
+    of :meth:`envs_jax.Environment.sample_layout`, kept by :func:`find_contested` and for no other reason, so that the
+    suite is a random sample of such layouts. Elsewhere the environment draws them so that they are contested.
 
     Args:
-        env: an environment with ``transition_table``, or with ``instance_at``, ``contested_pairs`` and layouts that are
-            contested by the way they are drawn.
         key: consumed.
+        env: a :class:`envs_jax.FiniteGraph` or :class:`envs_jax.ContestedChoice`.
         num_cases: Q, an even number.
         margin: see :func:`find_contested`.
-        max_nodes: the tasks' N.
-        params: the environment's parameters, the default ones if not given.
         most_rounds: draws of 512 layouts before giving up.
 
     Raises:
-        ValueError: if Q is odd or not positive, or the environment hardly ever has such layouts.
+        ValueError: if Q is odd or not positive, the environment is neither or has a single proposition, or it hardly
+            ever has such layouts.
     """
     if num_cases < 2 or num_cases % 2:
         raise ValueError(f"num_cases is {num_cases}, expected a positive even number: half of them are controls")
-    params = env.default_params if params is None else params
-    if not hasattr(env, "transition_table"):
-        return _drawn_suite(env, key, num_cases, max_nodes, params)
-    wanted = num_cases // 2
+    if env.num_propositions < 2:
+        raise ValueError(f"{env.name} has one proposition, expected two at least: one to go to first and another then")
+    if isinstance(env, FiniteGraph):
+        return _found_suite(key, env, num_cases // 2, margin, most_rounds)
+    if isinstance(env, ContestedChoice):
+        return _drawn_suite(key, env, num_cases // 2)
+    raise _not_contestable(env)
+
+
+def chosen_instances(env: Environment, states: State, first: np.ndarray) -> np.ndarray:
+    """Where first goals were reached, in the terms of ``ContestedSuite.right``, int ``[Q]``.
+
+    Args:
+        env: the suite's environment.
+        states: in which the first edges were taken, leading axis Q.
+        first: one-hot bool ``[Q, P]``, what the first edges reach.
+
+    Raises:
+        ValueError: if the environment has no contested choice.
+    """
+    if isinstance(env, FiniteGraph):
+        return np.asarray(jax.vmap(env.graph_state)(states))
+    if isinstance(env, ContestedChoice):
+        return np.asarray(jax.vmap(env.instance_at)(states, jnp.asarray(first)))
+    raise _not_contestable(env)
+
+
+def _not_contestable(env: Environment) -> ValueError:
+    return ValueError(f"{env.name} has no exact solver and no contested layouts, so contested choice is not known")
+
+
+def _found_suite(key: jax.Array, env: FiniteGraph, wanted: int, margin: int, most_rounds: int) -> ContestedSuite:
+    """Random layouts until ``wanted`` of them are contested and as many are controls."""
     kept: dict[bool, list[tuple[Any, ...]]] = {True: [], False: []}
     pairs = itertools.cycle(itertools.permutations(range(env.num_propositions), 2))
     for draw_key in jax.random.split(key, most_rounds):
-        layouts = jax.tree.map(np.asarray, _sample_layouts(env, jax.random.split(draw_key, 512), params))
-        graph = tabulate(env, layouts, params)
+        layouts = jax.tree.map(np.asarray, _sample_layouts(env, jax.random.split(draw_key, 512)))
+        graph = tabulate(env, layouts)
         for part in np.array_split(np.arange(512), 16):
-            tree = two_step_task(*next(pairs), env.num_propositions, max_nodes)
+            tree = two_step_task(*next(pairs), env.num_propositions)
             found = find_contested(graph[part], tree, margin=margin)
             for kind, flags in ((True, found.contested), (False, found.control)):
                 for i in np.flatnonzero(flags)[:2]:
@@ -214,32 +233,35 @@ def contested_suite(
     raise ValueError(f"{env.name}: only {found_so_far} in {512 * most_rounds} layouts, {wanted} of each are wanted")
 
 
-def _drawn_suite(env: Any, key: jax.Array, num_cases: int, max_nodes: int, params: Any) -> ContestedSuite:
+def _drawn_suite(key: jax.Array, env: ContestedChoice, wanted: int) -> ContestedSuite:
     """Contested layouts and, with the same keys, their mirrored controls; instance 0 is the right one on both."""
-    wanted = num_cases // 2
     pairs = itertools.islice(itertools.cycle(env.contested_pairs), wanted)
-    trees = [two_step_task(first, second, env.num_propositions, max_nodes) for first, second in pairs]
+    trees = [two_step_task(first, second, env.num_propositions) for first, second in pairs]
     tasks: TaskTree = jax.tree.map(lambda *leaves: np.stack(leaves * 2), *trees)
-    contested = np.arange(num_cases) < wanted
-    keys = jax.random.split(key, wanted)[np.arange(num_cases) % wanted]
-    layouts = _contested_layouts(env, keys, tasks.reach[:, 1], tasks.reach[:, 2], params, ~contested)
+    case = np.arange(2 * wanted)
+    contested = case < wanted
+    keys = jax.random.split(key, wanted)[case % wanted]
+    layouts = _contested_layouts(env, keys, tasks.reach[:, 1], tasks.reach[:, 2], ~contested)
     return ContestedSuite(
         layouts=jax.tree.map(np.asarray, layouts),
         tasks=tasks,
         contested=contested,
-        right=np.tile(np.array([True, False]), (num_cases, 1)),
+        right=np.tile(np.array([True, False]), (2 * wanted, 1)),
         nearest=contested.astype(np.int64),
-        optimum=np.full(num_cases, np.nan, np.float32),
+        optimum=np.full(2 * wanted, np.nan, np.float32),
     )
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _contested_layouts(env: Any, keys: Any, first: Any, second: Any, params: Any, mirrored: Any) -> Any:
+def _contested_layouts(
+    env: ContestedChoice, keys: jax.Array, first: jax.Array, second: jax.Array, mirrored: jax.Array
+) -> Layout:
     """One layout for each key."""
-    return jax.vmap(env.contested_layout, (0, 0, 0, None, 0))(keys, first, second, params, mirrored)
+    draw = functools.partial(env.contested_layout, params=env.default_params)
+    return jax.vmap(lambda key, one, other, flag: draw(key, one, other, mirrored=flag))(keys, first, second, mirrored)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _sample_layouts(env: Any, keys: jax.Array, params: Any) -> Any:
+def _sample_layouts(env: Environment, keys: jax.Array) -> Layout:
     """One layout for each key."""
-    return jax.vmap(env.sample_layout, (0, None))(keys, params)
+    return jax.vmap(env.sample_layout, (0, None))(keys, env.default_params)

@@ -1,4 +1,4 @@
-"""What simple agents score on finite labelled graphs: the marks a planning agent has to beat.
+"""Reference agents on finite labelled graphs, for a planning agent to beat: nearest goal first, blind first choices.
 
 Axes: **L** layouts, **S** graph states, **A** actions, **N** tree nodes, **C** children of the root.
 """
@@ -35,7 +35,7 @@ def myopic_steps(graph: Graph, tree: TaskTree) -> np.ndarray:
     place, state = graph.start.copy(), np.full(graph.num_layouts, machine.initial[0])
     steps = np.zeros(graph.num_layouts, np.float32)
     while True:
-        # Each turn is one step nearer to a goal, and there are finitely many goals on the way down the tree.
+        # Each turn is one step nearer to a goal, and there are finitely many goals on a path down the tree.
         following = graph.successors[layouts, place]  # int [L, A]
         ahead = entering[layouts[:, None], :, following]  # float [L, A, N]
         ahead = np.where(machine.open_edges[state][:, None, :], ahead, np.inf)
@@ -79,7 +79,7 @@ class BranchScores(NamedTuple):
     Attributes:
         optimal: of the best agent.
         random: expected, of an agent that draws its first edge uniformly and is the best from then on.
-        longest: of one that takes the first edge with the longest way below it (the mean over ties) and is the best
+        longest: of one that takes the first edge with the longest path below it (the mean over ties) and is the best
             from then on.
         matters: bool ``[L]``, whether the branches' optima differ by 30 % of the largest or more.
     """
@@ -116,7 +116,7 @@ def branch_scores(
 
 
 def _heights(tree: TaskTree) -> np.ndarray:
-    """Edges on the longest way down from each node, int ``[N]``."""
+    """Edges on the longest path down from each node, int ``[N]``."""
     parent, valid = np.asarray(tree.parent), np.asarray(tree.valid)
     height = np.zeros(tree.num_nodes, int)
     for node in range(tree.num_nodes - 1, 0, -1):  # Children come after their parents.

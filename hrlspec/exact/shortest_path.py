@@ -1,8 +1,8 @@
-"""A planner that knows the map, for worlds whose steps lead anywhere in a small square: least steps, and the way.
+"""Shortest paths for worlds whose steps lead anywhere in a small square, by planning on the map.
 
-It measures agents in continuous worlds as :mod:`hrlspec.exact.solver` does in finite ones. An environment offers
-``grid(layout)``: the places that whole steps lead to, from each to its eight neighbours or nowhere. On such a grid
-a way takes max(|Δx|, |Δy|) steps, as in the world itself, so every way found is one the environment allows, and what
+They measure agents in continuous worlds as :mod:`hrlspec.exact.solver` does in finite ones. The map is that of a
+:class:`envs_jax.GridMap`: the places that whole steps lead to, from each to its eight neighbours or nowhere. On it a
+path takes max(|Δx|, |Δy|) steps, as in the world itself, so every path found is one the environment allows, and what
 is lost is less than a step for each sub-task: goals are entered at a place of the grid.
 
 Axes: **L** layouts, **X**, **Y** places, **P** atomic propositions, **K** label sets, **M** automaton states.
@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any
 
 import jax
 import numpy as np
 
+from envs_jax import GridMap
+from envs_jax.base import Layout
 from hrlspec.exact.automaton import Automaton, automaton
 from hrlspec.spec.tree import TaskTree, subtask_avoid
 
@@ -47,36 +48,8 @@ class Grid:
         return Grid(self.symbols, self.symbol[rows], self.inside[rows], self.start[rows])
 
 
-@dataclasses.dataclass(frozen=True)
-class Way:
-    """How to satisfy a task in one layout.
-
-    Attributes:
-        places: int ``[t + 1, 2]``, the start and where each of t steps leads.
-        edges: int ``[t]``, the edge of the task that each step takes, ``TaskTree.NO_NODE`` for none.
-    """
-
-    places: np.ndarray  # int [t + 1, 2]
-    edges: np.ndarray  # int [t]
-
-    @property
-    def steps(self) -> int:
-        """The number of steps, t."""
-        return len(self.edges)
-
-
-def has_grid(env: Any) -> bool:
-    """Whether an environment tells where its steps lead, so that ways in it can be planned."""
-    return hasattr(env, "grid")
-
-
-def grid_of(env: Any, layouts: Any) -> Grid:
-    """The grids of layouts.
-
-    Args:
-        env: an environment with ``grid``.
-        layouts: a layout pytree with a leading axis L.
-    """
+def grid_of(env: GridMap, layouts: Layout) -> Grid:
+    """The grids of layouts (a layout pytree with a leading axis L)."""
     number = len(jax.tree.leaves(layouts)[0])
     found = [env.grid(jax.tree.map(lambda x, i=i: np.asarray(x[i]), layouts)) for i in range(number)]
     labels, inside, start = (np.stack(part) for part in zip(*found, strict=True))
@@ -85,11 +58,11 @@ def grid_of(env: Any, layouts: Any) -> Grid:
     return Grid(flat[first], symbol.reshape(labels.shape[:-1]), inside, start)
 
 
-def planned_steps(env: Any, layouts: Any, tree: TaskTree) -> tuple[np.ndarray, np.ndarray]:
+def planned_steps(env: GridMap, layouts: Layout, tree: TaskTree) -> tuple[np.ndarray, np.ndarray]:
     """What :func:`shortest_steps` and :func:`nearest_first_steps` give for a task; layouts that are alike cost once.
 
     Args:
-        env: an environment with ``grid``.
+        env: the environment.
         layouts: a layout pytree with a leading axis L.
         tree: one task (unbatched).
 
@@ -122,43 +95,10 @@ def shortest_steps(grid: Grid, tree: TaskTree) -> np.ndarray:
     return steps[(np.arange(grid.num_layouts), *grid.start.T)]
 
 
-def shortest_way(grid: Grid, tree: TaskTree, layout: int = 0) -> Way:
-    """A way of :func:`shortest_steps`; of several, the one through the neighbours of lowest index.
-
-    Args:
-        grid: L layouts.
-        tree: one task (unbatched).
-        layout: which of the layouts.
-
-    Raises:
-        ValueError: if nothing satisfies the task there.
-    """
-    one, machine = grid[layout : layout + 1], automaton(tree, grid.symbols)
-    tables = {state: table[0] for state, table in _steps_tables(one, machine).items()}
-    place, state = (int(one.start[0, 0]), int(one.start[0, 1])), int(machine.initial[0])
-    if not np.isfinite(tables[state][place]):
-        raise ValueError("nothing satisfies the task in this layout")
-    places, edges = [place], []
-    while state != Automaton.SATISFIED:
-        options = []
-        for there in _neighbours(one, place):
-            symbol = one.symbol[0][there]
-            for choice in range(machine.successor.shape[-1]):
-                after = int(machine.successor[symbol, state, choice])
-                if after != Automaton.VIOLATED:
-                    edge = int(machine.edge[symbol, state, choice])
-                    ahead = 0.0 if after == Automaton.SATISFIED else float(tables[after][there])
-                    options.append((ahead, there, after, edge))
-        _, place, state, edge = min(options, key=lambda option: option[0])
-        places.append(place)
-        edges.append(edge)
-    return Way(np.array(places), np.array(edges))
-
-
 def nearest_first_steps(grid: Grid, tree: TaskTree) -> np.ndarray:
-    """Steps of an agent that always goes to the nearest goal among the open sub-tasks, by a shortest way.
+    """Steps of an agent that always goes to the nearest goal among the open sub-tasks, by a shortest path.
 
-    Ways keep clear of what the sub-task avoids (eq. 2). Ties go to the sub-task of the lowest node, then to the
+    Paths keep clear of what the sub-task avoids (eq. 2). Ties go to the sub-task of the lowest node, then to the
     neighbour of the lowest index. An agent without a goal in reach has failed.
 
     Args:
@@ -184,13 +124,13 @@ def _nearest_first(one: Grid, tree: TaskTree, machine: Automaton) -> float:
             goal = (~reach[node] | one.symbols).all(-1) & ~harmed
             ends = np.where(goal[one.symbol], np.float32(0), np.float32(np.inf))
             closed = (goal | harmed)[one.symbol] | ~one.inside
-            onward = _spread(np.where(one.inside, ends, np.inf), closed)
+            onward = _path_lengths(np.where(one.inside, ends, np.inf), closed)
             distances[node] = np.where(closed, ends, onward)[0]
         return distances[node]
 
     place, state, steps = (int(one.start[0, 0]), int(one.start[0, 1])), int(machine.initial[0]), 0
     while state != Automaton.SATISFIED:
-        # Each turn is one step nearer to a goal, and there are finitely many goals on the way down the tree.
+        # Each turn is one step nearer to a goal, and there are finitely many goals on a path down the tree.
         nodes = np.flatnonzero(machine.open_edges[state]).tolist()
         around = list(_neighbours(one, place))
         ahead = np.array([[distance(node)[there] for there in around] for node in nodes]).reshape(len(nodes), -1)
@@ -216,7 +156,7 @@ def _steps_tables(grid: Grid, machine: Automaton) -> dict[int, np.ndarray]:
         Automaton.SATISFIED: np.zeros(shape, np.float32),
         Automaton.VIOLATED: np.full(shape, np.inf, np.float32),
     }
-    for state in _last_first(machine):
+    for state in _successors_first(machine):
         leaving = np.full(shape, np.inf, np.float32)
         left = ~grid.inside
         for symbol, successors in enumerate(machine.successor[:, state]):
@@ -227,11 +167,11 @@ def _steps_tables(grid: Grid, machine: Automaton) -> dict[int, np.ndarray]:
             for after in np.unique(successors):
                 following = ends[after] if after in ends else tables[int(after)]
                 leaving[here] = np.minimum(leaving[here], following[here])
-        tables[state] = _spread(leaving, left)
+        tables[state] = _path_lengths(leaving, left)
     return tables
 
 
-def _last_first(machine: Automaton) -> Iterator[int]:
+def _successors_first(machine: Automaton) -> Iterator[int]:
     """The running states that the initial one leads to, each after all that it leads to."""
     seen: set[int] = {Automaton.SATISFIED, Automaton.VIOLATED}
 
@@ -245,12 +185,12 @@ def _last_first(machine: Automaton) -> Iterator[int]:
     yield from visit(int(machine.initial[0]))
 
 
-def _spread(ends: np.ndarray, closed: np.ndarray) -> np.ndarray:
-    """Steps from each place to the best end, float32 ``[L, X, Y]``: at least 1, inf where there is no way.
+def _path_lengths(ends: np.ndarray, closed: np.ndarray) -> np.ndarray:
+    """Steps from each place to the best end, float32 ``[L, X, Y]``: at least 1, inf where there is no path.
 
     Args:
         ends: float32 ``[L, X, Y]``, further steps counted on entering an end; used where ``closed``.
-        closed: bool ``[L, X, Y]``, places at which a way ends, at the cost above; inf forbids them.
+        closed: bool ``[L, X, Y]``, places at which a path ends, at the cost above; inf forbids them.
     """
     # A rim keeps rows apart, so that neighbours are the same array shifted, and closed places by bounds that are equal.
     rim = ((0, 0), (1, 1), (1, 1))

@@ -1,7 +1,7 @@
 """Exact optima of tasks on finite labelled graphs: what evaluation measures agents against, and tests the library.
 
-Dynamic programming over graph state × automaton state (and time left for returns). A graph is what
-``env.transition_table`` gives; no environment is imported here. Numpy, vectorised over layouts.
+Dynamic programming over graph state × automaton state (and time left for returns), for environments that are a
+:class:`envs_jax.FiniteGraph`. Numpy, vectorised over layouts.
 
 Axes: **L** layouts, **S** graph states, **A** actions, **P** atomic propositions, **M** automaton states,
 **C** children of the root.
@@ -16,6 +16,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from envs_jax import FiniteGraph
+from envs_jax.base import Layout
 from hrlspec.exact.automaton import Automaton, automaton
 from hrlspec.spec.tree import TaskTree
 from hrlspec.tasks.rewards import RewardMachine
@@ -48,16 +50,9 @@ class Graph:
         return Graph(self.successors[index], self.labels[index], self.start[index])
 
 
-def tabulate(env: Any, layouts: Any, params: Any = None) -> Graph:
-    """The graphs of an environment's layouts.
-
-    Args:
-        env: an environment with ``transition_table``.
-        layouts: a layout pytree with a leading axis L.
-        params: its parameters, the default ones if not given.
-    """
-    params = env.default_params if params is None else params
-    tables = jax.vmap(env.transition_table, (0, None))(layouts, params)
+def tabulate(env: FiniteGraph, layouts: Layout) -> Graph:
+    """The graphs of an environment's layouts (a layout pytree with a leading axis L)."""
+    tables = jax.vmap(env.transition_table, (0, None))(layouts, env.default_params)
     successors, labels, start = (np.asarray(table) for table in tables)
     return Graph(successors.astype(np.int64), labels.astype(bool), start.astype(np.int64))
 
@@ -77,28 +72,16 @@ def optimal_steps(graph: Graph, tree: TaskTree) -> np.ndarray:
     return _from_start(graph, tree, None, steps_table)[:, 0]
 
 
-def branch_steps(graph: Graph, tree: TaskTree) -> np.ndarray:
-    """:func:`optimal_steps` when the first edge must be that to each of the root's children, float32 ``[L, C]``."""
-    return _from_start(graph, tree, None, steps_table)[:, 1:]
+def branch_returns(graph: Graph, tree: TaskTree, rewards: RewardMachine | None, horizon: int) -> np.ndarray:
+    """The largest undiscounted return when no first edge but that to each of the root's children may be taken.
 
-
-def optimal_return(graph: Graph, tree: TaskTree, rewards: RewardMachine | None, horizon: int) -> np.ndarray:
-    """The largest undiscounted return within a horizon; episodes end on satisfaction, violation or the horizon.
+    Episodes end on satisfaction, violation or the horizon. The largest of all branches is the optimum.
 
     Args:
         graph: L layouts.
         tree: one task (unbatched).
         rewards: what is paid; 1 for completing the task if ``None``.
         horizon: steps in an episode.
-
-    Returns:
-        float32 ``[L]``.
-    """
-    return _from_start(graph, tree, rewards, lambda one: returns_table(one, horizon))[:, 0]
-
-
-def branch_returns(graph: Graph, tree: TaskTree, rewards: RewardMachine | None, horizon: int) -> np.ndarray:
-    """:func:`optimal_return` when no first edge but that to each of the root's children may be taken.
 
     Returns:
         float32 ``[L, C]``, 0 where the branch cannot be entered within the horizon.
@@ -112,7 +95,7 @@ def root_children(tree: TaskTree) -> np.ndarray:
 
 
 def steps_table(product: Product) -> np.ndarray:
-    """Least steps to satisfaction from everywhere, float32 ``[L, S, M]``, inf where there is no way.
+    """Least steps to satisfaction from everywhere, float32 ``[L, S, M]``, inf where there is no path.
 
     Values of exactly k steps appear in round k and never change, so a round that adds none is the last.
     """

@@ -1,23 +1,31 @@
-"""Agents written by hand, for Letter: what they score is known without running the library's yardsticks."""
+"""Agents written by hand, for Letter: what they score is known without running the library's reference agents."""
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+import functools
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs_jax import Environment
 from envs_jax.letter.world import MOVES
-from hrlspec.agent.agent import Agent, Params, View
+from hrlspec.agent.agent import Agent
+from hrlspec.agent.experience import View
+from hrlspec.agent.high_level import Choice, HighLevel
+from hrlspec.agent.low_level import LowLevel, Params
 from hrlspec.agent.networks.controller import Instruction
+from hrlspec.config import Config
+from hrlspec.methods import Method
 from hrlspec.spec import TaskState, TaskTree, open_edges, subtask_avoid
 
 FAR = 1e4
 
 
 def manner(*, look_ahead: bool = False, last: bool = False) -> Params:
-    """How a :class:`Walker` acts.
+    """How a `walker` acts.
 
     Args:
         look_ahead: count the way from each goal to the next sub-task's nearest one too (for sequences, where nothing
@@ -27,11 +35,34 @@ def manner(*, look_ahead: bool = False, last: bool = False) -> Params:
     return {"look_ahead": jnp.bool_(look_ahead), "last": jnp.bool_(last)}
 
 
-class Walker(Agent):
-    """Walks a shortest path to what its sub-task reaches, clear of what it avoids. Act greedily.
+@dataclasses.dataclass(frozen=True)
+class ByIndex(HighLevel):
+    """Takes the edge into the first or the last open node."""
 
-    Its parameters, which change how it acts without compiling anything anew, come from :func:`manner`.
-    """
+    def init(self, key: jax.Array, low: LowLevel, view: View, tree: TaskTree) -> Any:
+        return {}
+
+    def choose(
+        self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
+    ) -> Choice:
+        index = jnp.arange(tree.num_nodes)
+        wish = jnp.where(params["last"], index, -index).astype(jnp.float32)
+        logits = jnp.where(jax.vmap(open_edges)(tree, state), wish, -FAR)
+        return Choice(logits, jnp.zeros(len(logits)), jnp.zeros(logits.shape), told.ahead)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scripted(Method):
+    """Nothing is learned."""
+
+    high: ByIndex = ByIndex()
+
+    name: ClassVar[str] = "scripted"
+    about: ClassVar[str] = "an agent written by hand"
+
+
+class Walking(LowLevel):
+    """Walks a shortest path to what its sub-task reaches, clear of what it avoids. Act greedily."""
 
     def instruct(self, params: Params, tree: TaskTree) -> Instruction:
         """The sub-task of every edge and what its first child reaches, leading axis N."""
@@ -42,16 +73,6 @@ class Walker(Agent):
         return Instruction(
             reach=reach, avoid=avoid, ahead=ahead, behind=ahead[:, :0], future=jnp.zeros((tree.num_nodes, 0))
         )
-
-    def plan_ahead(
-        self, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
-    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        """By index."""
-        del view
-        num_envs, num_nodes = tree.parent.shape
-        index = jnp.arange(num_nodes)
-        wish = jnp.where(params["last"], index, -index).astype(jnp.float32)
-        return jnp.where(jax.vmap(open_edges)(tree, state), wish, -FAR), jnp.zeros(num_envs), wish, told.ahead
 
     def control(self, params: Params, view: View, told: Instruction) -> tuple[jax.Array, jax.Array]:
         """Minus the steps that remain after each action."""
@@ -66,6 +87,19 @@ class Walker(Agent):
         middle = planes.shape[-1] // 2
         rows, columns = (middle + np.array(MOVES)).T % planes.shape[-1]
         return -ahead[rows, columns], jnp.float32(0)
+
+
+class Walker(Agent):
+    """An agent whose parameters, which change how it acts without compiling anything anew, come from `manner`."""
+
+    @functools.cached_property
+    def low(self) -> Walking:
+        return Walking(self.env, self.config, self.method.sees, self.high.follows_plan)
+
+
+def walker(env: Environment) -> Walker:
+    """The agent in an environment that looks like Letter."""
+    return Walker(env, Config(), Scripted())
 
 
 def _distance(cost: jax.Array, closed: jax.Array) -> jax.Array:

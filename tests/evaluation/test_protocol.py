@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 
 import envs_jax
-from envs_jax.letter.world import Letter
-from hrlspec.agent.agent import Agent, Params
+from hrlspec.agent.agent import Agent
+from hrlspec.agent.low_level import Params
+from hrlspec.agent.networks.planner import PlannerConfig
 from hrlspec.config import Config, NetworkConfig
 from hrlspec.evaluation import (
     ChoiceEvaluation,
     Suite,
     SuiteEvaluation,
+    choice_evaluation,
     episodes,
     evaluate_suite,
     final_evaluation,
@@ -27,23 +29,17 @@ from hrlspec.evaluation import (
     suite_from_trees,
 )
 from hrlspec.exact.contested import contested_suite
+from hrlspec.methods import OURS
 from hrlspec.tasks.rewards import reward_machine
 from hrlspec.tasks.sampling import sample_sequences
-from tests.evaluation.scripted import Walker, manner
+from tests.bare import Bare
+from tests.evaluation.scripted import manner, walker
 
 LETTER = envs_jax.make("letter")
 COMPLETION = reward_machine(LETTER.propositions)
-WALKER = Walker(LETTER, Config())
+WALKER = walker(LETTER)
 NEAREST, AHEAD = manner(), manner(look_ahead=True)
 KEY = jax.random.key(0)
-
-
-class Unsolved(Letter):
-    """Letter without an exact solver, as Walk and Zone will be."""
-
-    @property
-    def transition_table(self):  # type: ignore[override]
-        raise AttributeError
 
 
 def _sequences(level: int, num_tasks: int, max_avoid: int) -> Suite:
@@ -70,14 +66,14 @@ def _cases():
     return make_cases(LETTER, _sequences(4, 12, 2), layouts_per_task=10)
 
 
-def test_the_agent_that_goes_to_the_nearest_goal_scores_what_the_yardstick_says():
+def test_the_agent_that_goes_to_the_nearest_goal_scores_what_the_reference_agent_does():
     cases = _cases()
     result = SuiteEvaluation(cases, greedy=True)(KEY, WALKER, NEAREST, COMPLETION)
     total = result.total
     assert total.episodes == 120
     assert total.success_rate.estimate == total.myopic_success_rate
     assert total.spl.estimate == pytest.approx(total.myopic_spl, abs=1e-6)
-    assert total.spl.estimate < total.success_rate.estimate  # Or the yardstick would measure nothing here.
+    assert total.spl.estimate < total.success_rate.estimate  # Or the comparison would show nothing here.
     assert total.return_mean.estimate == total.success_rate.estimate
     for each in result.per_task:
         assert each.score.spl.estimate == pytest.approx(each.score.myopic_spl, abs=1e-6), each.task
@@ -96,7 +92,7 @@ def test_the_agent_that_looks_ahead_is_optimal_on_two_sub_tasks():
 
 
 def test_contested_choices_of_both_agents():
-    evaluation = ChoiceEvaluation(contested_suite(LETTER, jax.random.key(2), num_cases=60), greedy=True)
+    evaluation = ChoiceEvaluation(contested_suite(jax.random.key(2), LETTER, num_cases=60), greedy=True)
     myopic = evaluation(KEY, WALKER, NEAREST, COMPLETION)
     assert (myopic.contested.estimate, myopic.controls.estimate, myopic.score.estimate) == (0, 1, 0.5)
     ahead = evaluation(KEY, WALKER, AHEAD, COMPLETION)
@@ -120,16 +116,9 @@ def test_return_over_optimum_of_the_longest_and_of_the_shortest_branch():
 
 
 def test_an_untrained_agent_and_nothing_compiled_twice():
-    network = NetworkConfig(
-        latent=8,
-        conv_channels=(),
-        encoder_mlp=(8,),
-        planner_features=8,
-        planner_hidden=8,
-        planner_rounds=0,
-        task_rounds=0,
-    )
-    agent = Agent(LETTER, Config(network=network))
+    network = NetworkConfig(latent=8, conv_channels=(), encoder_mlp=(8,), task_rounds=0)
+    method = OURS.replace(network=PlannerConfig(features=8, hidden=8, rounds=0))
+    agent = Agent(LETTER, Config(network=network), method)
     suite = _sequences(3, 15, 1)
     periodic = periodic_evaluation(LETTER, suite, episodes=20)
     before = episodes._run._cache_size()
@@ -164,8 +153,8 @@ def test_the_final_evaluation_has_ten_layouts_or_more_and_enough_episodes():
 
 
 def test_without_an_exact_solver_all_but_spl_is_there():
-    env = Unsolved()
-    result = evaluate_suite(KEY, Walker(env, Config()), NEAREST, COMPLETION, _sequences(4, 12, 2), greedy=True)
+    env = Bare(LETTER)
+    result = evaluate_suite(KEY, walker(env), NEAREST, COMPLETION, _sequences(4, 12, 2), greedy=True)
     assert result.total.spl is result.total.myopic_spl is result.total.myopic_success_rate is None
     assert result.total.success_rate.estimate > 0.9
     assert result.excluded == 0
@@ -173,3 +162,5 @@ def test_without_an_exact_solver_all_but_spl_is_there():
     assert "eval/spl" not in result.metrics()
     with pytest.raises(ValueError, match="no exact solver"):
         return_evaluation(env, _sequences(2, 2, 0), COMPLETION)
+    with pytest.raises(ValueError, match="bare letter has no exact solver and no contested layouts"):
+        choice_evaluation(env)

@@ -1,7 +1,8 @@
-"""The planner that knows the map against the exact solver, hand-computed lengths, and the world itself."""
+"""Shortest paths on the map against the exact solver, hand-computed lengths, and the world itself."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -12,18 +13,18 @@ import pytest
 import envs_jax
 from envs_jax.walk.world import WalkLayout
 from hrlspec.exact import solver
+from hrlspec.exact.automaton import Automaton, automaton
 from hrlspec.exact.reference_agents import myopic_steps
 from hrlspec.exact.shortest_path import (
     Grid,
+    _neighbours,
+    _steps_tables,
     grid_of,
-    has_grid,
     nearest_first_steps,
     planned_steps,
     shortest_steps,
-    shortest_way,
 )
-from hrlspec.spec import SATISFIED, TaskTree, advance, initial, parse
-from hrlspec.spec import compile as compile_task
+from hrlspec.spec import SATISFIED, TaskTree, advance, compile_task, initial, parse
 from hrlspec.tasks.sampling import sample_trees
 
 
@@ -78,6 +79,40 @@ def _as_graph(grid: Grid) -> solver.Graph:
     return solver.Graph(successors, labels, grid.start[:, 0] * height + grid.start[:, 1])
 
 
+@dataclasses.dataclass(frozen=True)
+class Path:
+    """How to satisfy a task: the places from the start on, int ``[t + 1, 2]``, and the edge that each step takes."""
+
+    places: np.ndarray
+    edges: np.ndarray
+
+    @property
+    def steps(self) -> int:
+        return len(self.edges)
+
+
+def _shortest_path(grid: Grid, tree: TaskTree, layout: int) -> Path:
+    """A path down the tables of least steps; of several, the one through the neighbours of lowest index."""
+    one, machine = grid[layout : layout + 1], automaton(tree, grid.symbols)
+    tables = {state: table[0] for state, table in _steps_tables(one, machine).items()}
+    place, state = (int(one.start[0, 0]), int(one.start[0, 1])), int(machine.initial[0])
+    places, edges = [place], []
+    while state != Automaton.SATISFIED:
+        options = []
+        for there in _neighbours(one, place):
+            symbol = one.symbol[0][there]
+            for choice in range(machine.successor.shape[-1]):
+                after = int(machine.successor[symbol, state, choice])
+                if after != Automaton.VIOLATED:
+                    edge = int(machine.edge[symbol, state, choice])
+                    ahead = 0.0 if after == Automaton.SATISFIED else float(tables[after][there])
+                    options.append((ahead, there, after, edge))
+        _, place, state, edge = min(options, key=lambda option: option[0])
+        places.append(place)
+        edges.append(edge)
+    return Path(np.array(places), np.array(edges))
+
+
 def test_least_steps_are_the_exact_solvers() -> None:
     rng = np.random.default_rng(1)
     finite = 0
@@ -101,21 +136,19 @@ def test_nearest_first_is_the_exact_worlds_myopic_agent() -> None:
     assert differ > 5
 
 
-def test_ways_do_what_they_say() -> None:
+def test_paths_do_what_they_say() -> None:
     rng = np.random.default_rng(3)
     for tree in _trees(10, 3, seed=2):
         grid = _random_grid(rng, 3, 8, 9)
         for layout, steps in enumerate(shortest_steps(grid, tree)):
             if not np.isfinite(steps):
-                with pytest.raises(ValueError, match="nothing satisfies"):
-                    shortest_way(grid, tree, layout)
                 continue
-            way = shortest_way(grid, tree, layout)
-            assert way.steps == steps == len(way.places) - 1
-            assert np.array_equal(way.places[0], grid.start[layout])
-            assert np.abs(np.diff(way.places, axis=0)).max() <= 1
-            assert grid.inside[layout][tuple(way.places.T)].all()
-            taken = way.edges[way.edges != TaskTree.NO_NODE]
+            path = _shortest_path(grid, tree, layout)
+            assert path.steps == steps == len(path.places) - 1
+            assert np.array_equal(path.places[0], grid.start[layout])
+            assert np.abs(np.diff(path.places, axis=0)).max() <= 1
+            assert grid.inside[layout][tuple(path.places.T)].all()
+            taken = path.edges[path.edges != TaskTree.NO_NODE]
             assert np.array_equal(np.asarray(tree.parent)[taken], [0, *taken[:-1]])
             assert tree.accepting[taken[-1]]
 
@@ -183,7 +216,7 @@ def test_conjunctions_are_met_where_discs_overlap() -> None:
 
 
 @pytest.mark.parametrize("name", ["walk", "flatworld"])
-def test_ways_can_be_walked(name: str) -> None:
+def test_paths_can_be_walked(name: str) -> None:
     """The world itself, step by step, with the monitor beside it: satisfied after exactly so many steps."""
     env = envs_jax.make(name, layout_seed=3)
     params = env.default_params
@@ -195,12 +228,12 @@ def test_ways_can_be_walked(name: str) -> None:
         row = i % 3
         if not np.isfinite(shortest_steps(grid[row : row + 1], tree)[0]):
             continue
-        way = shortest_way(grid, tree, row)
+        path = _shortest_path(grid, tree, row)
         _, state = env.reset_to(jax.tree.map(lambda x, row=row: x[row], layouts), jax.random.key(0), params)
         task = initial(tree)
-        # The next edge of the way is what the planner has assigned.
-        ahead = [way.edges[t:][way.edges[t:] != TaskTree.NO_NODE][0] for t in range(way.steps)]
-        for t, move in enumerate(np.diff(way.places, axis=0)):
+        # The next edge of the path is what the planner has assigned.
+        ahead = [path.edges[t:][path.edges[t:] != TaskTree.NO_NODE][0] for t in range(path.steps)]
+        for t, move in enumerate(np.diff(path.places, axis=0)):
             assert int(task.status) != SATISFIED
             _, state, _, terminated, _, _ = step(jax.random.key(0), state, jnp.asarray(move, jnp.float32), params)
             assert not terminated
@@ -231,8 +264,3 @@ def test_the_grid_loses_less_than_a_step_for_each_sub_task() -> None:
     grid = grid_of(env, jax.tree.map(lambda *x: np.stack(x), *moved))
     steps = shortest_steps(grid, tree)
     assert np.ptp(steps) <= 5
-
-
-def test_which_environments_have_a_grid() -> None:
-    assert has_grid(envs_jax.make("walk"))
-    assert not has_grid(envs_jax.make("letter"))

@@ -139,23 +139,23 @@ def brute_force(
     return steps, best
 
 
+def _optimal_return(graph: solver.Graph, tree: TaskTree, machine: RewardMachine | None, horizon: int) -> float:
+    """Of one layout."""
+    return float(solver.branch_returns(graph, tree, machine, horizon)[0].max())
+
+
 def _assert_matches_brute_force(
     world: World, wheres: list[object], graph: solver.Graph, tree: TaskTree, machine: RewardMachine, horizon: int
 ) -> None:
     num_actions = graph.successors.shape[-1]
-    steps, returns = solver.optimal_steps(graph, tree), solver.optimal_return(graph, tree, machine, horizon)
-    steps_by_branch, returns_by_branch = (
-        solver.branch_steps(graph, tree),
-        solver.branch_returns(graph, tree, machine, horizon),
-    )
+    steps, returns = solver.optimal_steps(graph, tree), solver.branch_returns(graph, tree, machine, horizon)
     brute = functools.partial(brute_force, tree=tree, machine=machine, num_actions=num_actions, horizon=horizon)
     for i, where in enumerate(wheres):
         expected = brute(world, where, start=int(graph.start[i]))
-        assert (steps[i] if steps[i] <= horizon else np.inf, returns[i]) == pytest.approx(expected)
+        assert (steps[i] if steps[i] <= horizon else np.inf, returns[i].max()) == pytest.approx(expected)
         for c, child in enumerate(solver.root_children(tree)):
-            expected = brute(world, where, start=int(graph.start[i]), first=int(child))
-            found = steps_by_branch[i, c]
-            assert (found if found <= horizon else np.inf, returns_by_branch[i, c]) == pytest.approx(expected)
+            _, expected_return = brute(world, where, start=int(graph.start[i]), first=int(child))
+            assert returns[i, c] == pytest.approx(expected_return)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -213,7 +213,7 @@ def test_all_action_sequences_of_a_tiny_world() -> None:
         one = graph[i : i + 1]
         optimum = float(solver.optimal_steps(one, tree)[0])
         assert (optimum if optimum <= horizon else np.inf) == float(steps.min())
-        assert solver.optimal_return(one, tree, machine, horizon)[0] == pytest.approx(float(returns.max()))
+        assert _optimal_return(one, tree, machine, horizon) == pytest.approx(float(returns.max()))
         seen.append(optimum)
     assert len(set(seen)) > 2
 
@@ -267,7 +267,8 @@ def test_a_wall_that_must_not_be_touched() -> None:
     assert solver.optimal_steps(graph, tree_of([(0, "a", "")], num_propositions=4))[0] == 4
     assert solver.optimal_steps(graph, tree_of([(0, "a", "c")], num_propositions=4))[0] == np.inf
     either = tree_of([(0, "a", "c"), (0, "c", "")], num_propositions=4)
-    assert solver.branch_steps(graph, either).tolist() == [[np.inf, 1.0]]
+    assert solver.branch_returns(graph, either, None, 75).tolist() == [[0.0, 1.0]]
+    assert solver.optimal_steps(graph, either)[0] == 1
     after = tree_of([(0, "c", ""), (1, "a", "c")], num_propositions=4)
     assert solver.optimal_steps(graph, after)[0] == 4
 
@@ -276,26 +277,26 @@ def test_returns_in_closed_form(five: solver.Graph) -> None:
     machine = reward_machine(
         FIVE.propositions, subtask=1.0, bonuses=[Bonus("a", "d", 5.0), Bonus("b", "d", 10.0, ("a",))]
     )
-    value = functools.partial(solver.optimal_return, five)
+    value = functools.partial(_optimal_return, five)
     chain = tree_of([(0, "a", ""), (1, "d", "")], num_propositions=4)
     # Set 1 pays for completion alone; set 2 for both sub-tasks, completion and the bonus.
-    assert value(chain, None, 75)[0] == 1.0
-    assert value(chain, machine, 75)[0] == 2 + 1 + 5
+    assert value(chain, None, 75) == 1.0
+    assert value(chain, machine, 75) == 2 + 1 + 5
     # (0, 2) is 2 away, and d another 3, round the edge: two rows up, one column to the left.
-    assert value(chain, machine, 5)[0] == 8.0
-    assert value(chain, machine, 4)[0] == 1.0
-    assert value(chain, machine, 1)[0] == 0.0
+    assert value(chain, machine, 5) == 8.0
+    assert value(chain, machine, 4) == 1.0
+    assert value(chain, machine, 1) == 0.0
     # b before a: the second rule counts although another sub-task lies between its letters.
     longer = tree_of([(0, "b", ""), (1, "a", ""), (2, "d", "")], num_propositions=4)
-    assert value(longer, machine, 75)[0] == 3 + 1 + 5 + 10
+    assert value(longer, machine, 75) == 3 + 1 + 5 + 10
     # Reaching a first bars it.
     barred = tree_of([(0, "a", ""), (1, "b", ""), (2, "d", "")], num_propositions=4)
-    assert value(barred, machine, 75)[0] == 3 + 1 + 5
+    assert value(barred, machine, 75) == 3 + 1 + 5
     # Of two branches the one worth more is taken, though it is longer.
     both = tree_of([(0, "c", ""), (0, "b", ""), (2, "d", "")], num_propositions=4)
     assert solver.branch_returns(five, both, machine, 75).tolist() == [[2.0, 13.0]]
-    assert value(both, machine, 75)[0] == 13.0
-    assert value(both, machine, 2)[0] == 2.0
+    assert value(both, machine, 75) == 13.0
+    assert value(both, machine, 2) == 2.0
 
 
 def test_one_edge_is_not_both_letters_of_a_bonus() -> None:
@@ -304,9 +305,9 @@ def test_one_edge_is_not_both_letters_of_a_bonus() -> None:
     layout[0, 0, 1] = 0
     graph = solver.tabulate(FIVE, layout)
     machine = reward_machine(FIVE.propositions, bonuses=[Bonus("a", "a", 7.0)])
-    assert solver.optimal_return(graph, tree_of([(0, "a", "")], num_propositions=4), machine, 9)[0] == 1.0
+    assert _optimal_return(graph, tree_of([(0, "a", "")], num_propositions=4), machine, 9) == 1.0
     twice = tree_of([(0, "a", ""), (1, "a", "")], num_propositions=4)
-    assert solver.optimal_return(graph, twice, machine, 9)[0] == 8.0
+    assert _optimal_return(graph, twice, machine, 9) == 8.0
     assert solver.optimal_steps(graph, twice)[0] == 3.0
 
 
@@ -348,4 +349,4 @@ def test_propositions_must_agree(five: solver.Graph) -> None:
     with pytest.raises(ValueError, match=r"expected \[K, 3\]"):
         solver.optimal_steps(five, tree_of([(0, "a", "")], num_propositions=3))
     with pytest.raises(ValueError, match="rewards over 5 propositions, expected 4"):
-        solver.optimal_return(five, tree_of([(0, "a", "")], num_propositions=4), reward_machine("abcde"), 75)
+        solver.branch_returns(five, tree_of([(0, "a", "")], num_propositions=4), reward_machine("abcde"), 75)
