@@ -1,8 +1,8 @@
 """Arrays as annotations speak of them: ``Float[Array, "T E"]`` is a float array of T time steps and E environments.
 
 Axes are named once and the letters used everywhere: **E** environments, **T** time steps, **N** tree nodes, **C**
-children, **P** atomic propositions, **F** features, **D** depth, **M** tasks. An axis of its own file is explained there;
-``...`` and ``*lead`` are any leading axes. Nothing is checked at run time but in the tests (`jaxtyping`, with beartype).
+children, **P** atomic propositions, **F** features, **D** depth, **M** tasks. Axes of one file are explained there;
+``...`` and ``*lead`` are any leading axes. Nothing is checked at run time but in the tests (jaxtyping with beartype).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Shapes and types of all functions and structs of the packages, checked while tests run.
 
-``install()`` must come before the packages are imported. A function is checked whenever it is called or traced. A struct
-is checked where our own code makes one: JAX makes them too, around whatever stands for a leaf.
+``install()`` must come before the packages are imported. A function is checked whenever it is called or traced. A
+struct is checked where our own code makes one: JAX makes them too, around whatever stands for a leaf.
 """
 
 from __future__ import annotations

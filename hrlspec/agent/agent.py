@@ -8,10 +8,11 @@ from __future__ import annotations
 import dataclasses
 import functools
 
-import jax
 import jax.numpy as jnp
+from jaxtyping import Key
 
 from envs_jax import Environment
+from envs_jax.arrays import Array
 from hrlspec.agent.experience import view_of
 from hrlspec.agent.high_level import HighLevel
 from hrlspec.agent.low_level import LowLevel, Params
@@ -51,7 +52,7 @@ class Agent:
         """The low level."""
         return LowLevel(self.env, self.config, self.method.sees, self.high.follows_plan)
 
-    def init(self, key: jax.Array) -> Params:
+    def init(self, key: Key[Array, ""]) -> Params:
         """Fresh parameters of all parts: ``low``, ``high`` and ``reach_critic``. The key is consumed."""
         view = view_of(self.env, jnp.zeros(self.env.observation_shape))
         tree = _blank_tree(self.env.num_propositions)

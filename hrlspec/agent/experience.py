@@ -9,62 +9,63 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Bool, Float32, Int32
 
 from envs_jax import Environment
+from envs_jax.arrays import Array
 from hrlspec.spec import TaskState, TaskTree
 
 
 class View(NamedTuple):
     """An observation by whom it concerns, as `Environment.proposition_view` splits it."""
 
-    propositions: jax.Array  # float32 [..., P, ...], what is seen of each proposition
-    shared: jax.Array  # float32 [..., F0], what belongs to none of them
+    propositions: Float32[Array, "..."]  # [..., P, ...], what is seen of each proposition
+    shared: Float32[Array, "..."]  # [..., F0], what belongs to none of them
 
 
 @struct.dataclass
 class HighDecision:
     """What the high level decided; the edge and what lies ahead stay in force, the rest is meaningful where made."""
 
-    made: jax.Array  # bool, a decision was made before this step
-    edge: jax.Array  # int32, the edge assigned
-    ahead: jax.Array  # float32 [..., D, P], what is meant to be reached 1, 2, ... sub-tasks after it
-    log_prob: jax.Array  # float32
-    value: jax.Array  # float32, V^h of the remaining task
-    advice: jax.Array  # float32 [..., N], what the low level said of each edge
+    made: Bool[Array, "*lead"]  # a decision was made before this step
+    edge: Int32[Array, "*lead"]  # the edge assigned
+    ahead: Float32[Array, "*lead D P"]  # what is meant to be reached 1, 2, ... sub-tasks after it
+    log_prob: Float32[Array, "*lead"]
+    value: Float32[Array, "*lead"]  # V^h of the remaining task
+    advice: Float32[Array, "*lead N"]  # what the low level said of each edge
 
 
 @struct.dataclass
 class LowDecision:
     """What the low level decided."""
 
-    action: jax.Array  # int32, or float32 [..., A]
-    log_prob: jax.Array  # float32, what the ratio is taken to
-    value: jax.Array  # float32, V^l before the step
-    shielded: jax.Array  # bool, the shield replaced the action
+    action: Int32[Array, "*lead"] | Float32[Array, "*lead A"]
+    log_prob: Float32[Array, "*lead"]  # what the ratio is taken to
+    value: Float32[Array, "*lead"]  # V^l before the step
+    shielded: Bool[Array, "*lead"]  # the shield replaced the action
 
 
 @struct.dataclass
 class Outcome:
     """What a step led to, before any reset."""
 
-    labels: jax.Array  # bool [..., P]
-    node: jax.Array  # int32, task node after: the edge that was taken, or the node before when none was
-    edge_taken: jax.Array  # bool
-    satisfied: jax.Array  # bool
-    reward: jax.Array  # float32
-    terminated: jax.Array  # bool, task satisfied or violated, or the environment ended the episode
-    truncated: jax.Array  # bool, horizon reached
+    labels: Bool[Array, "*lead P"]
+    node: Int32[Array, "*lead"]  # task node after: the edge that was taken, or the node before when none was
+    edge_taken: Bool[Array, "*lead"]
+    satisfied: Bool[Array, "*lead"]
+    reward: Float32[Array, "*lead"]
+    terminated: Bool[Array, "*lead"]  # task satisfied or violated, or the environment ended the episode
+    truncated: Bool[Array, "*lead"]  # horizon reached
 
 
 @struct.dataclass
 class Bootstrap:
     """Values of the state after a step; read where an episode was truncated, and after the last step of a rollout."""
 
-    low: jax.Array  # float32
-    high: jax.Array  # float32
+    low: Float32[Array, "*lead"]
+    high: Float32[Array, "*lead"]
 
 
 @struct.dataclass
@@ -72,19 +73,19 @@ class Step:
     """One step while collecting, with leading axes ``[T, E]``."""
 
     view: View  # before
-    task: jax.Array  # int32, row of the task book
-    level: jax.Array  # int32, its curriculum level
-    episode: jax.Array  # int32, which episode of this rollout, 0-based
-    since: jax.Array  # int32, steps since the edge in force was assigned
+    task: Int32[Array, "*lead"]  # row of the task book
+    level: Int32[Array, "*lead"]  # its curriculum level
+    episode: Int32[Array, "*lead"]  # which episode of this rollout, 0-based
+    since: Int32[Array, "*lead"]  # steps since the edge in force was assigned
     state: TaskState  # before
     high: HighDecision
     low: LowDecision
     outcome: Outcome
     bootstrap: Bootstrap
-    reach_value: jax.Array  # float32 [..., P], the reach critic's value after; empty without a shield
+    reach_value: Float32[Array, "*lead _"]  # [..., P], the reach critic's value after; empty without a shield
 
 
-def view_of(env: Environment, observation: jax.Array) -> View:
+def view_of(env: Environment, observation: Float32[Array, "..."]) -> View:
     """The view of one observation."""
     return View(*env.proposition_view(observation))
 
@@ -110,28 +111,28 @@ class Experience:
     """
 
     trees: TaskTree
-    slot: jax.Array  # int32, which of the trees
+    slot: Int32[Array, "V T"]  # which of the trees
     view: View
     state: TaskState
     high: HighDecision
     low: LowDecision
     outcome: Outcome
     bootstrap: Bootstrap
-    goal: jax.Array  # bool [..., P], p₊ of the edge in force
-    reached: jax.Array  # bool [..., P], p₊ of the edge taken
-    learns_low: jax.Array  # bool, counts in the low level's policy loss
-    learns_high: jax.Array  # bool, counts in the high level's policy loss
-    valid: jax.Array  # bool, counts at all
+    goal: Bool[Array, "V T P"]  # p₊ of the edge in force
+    reached: Bool[Array, "V T P"]  # p₊ of the edge taken
+    learns_low: Bool[Array, "V T"]  # counts in the low level's policy loss
+    learns_high: Bool[Array, "V T"]  # counts in the high level's policy loss
+    valid: Bool[Array, "V T"]  # counts at all
 
 
 @struct.dataclass
 class Credit:
     """What samples are worth to a level."""
 
-    advantage: jax.Array  # float32
-    target: jax.Array  # float32, of the value
-    learns: jax.Array  # bool, counts in the policy loss
-    valid: jax.Array  # bool, counts at all
+    advantage: Float32[Array, "*lead"]
+    target: Float32[Array, "*lead"]  # of the value
+    learns: Bool[Array, "*lead"]  # counts in the policy loss
+    valid: Bool[Array, "*lead"]  # counts at all
 
 
 @struct.dataclass
@@ -139,11 +140,11 @@ class LowBatch:
     """Samples of the low level, leading axes ``[V, T]``; ``trees`` is ``[V, S, ...]``."""
 
     trees: TaskTree
-    slot: jax.Array  # int32, which of the trees
+    slot: Int32[Array, "V T"]  # which of the trees
     view: View
-    edge: jax.Array  # int32, the edge in force
-    ahead: jax.Array  # float32 [..., D, P], what is meant to be reached after it
-    feasible: jax.Array  # bool [..., N], the open edges; empty unless the low level is told the whole task
+    edge: Int32[Array, "V T"]  # the edge in force
+    ahead: Float32[Array, "V T D P"]  # what is meant to be reached after it
+    feasible: Bool[Array, "V T _"]  # [V, T, N], the open edges; empty unless the low level is told the whole task
     decision: LowDecision
     credit: Credit
 
@@ -157,6 +158,6 @@ class HighBatch:
     state: TaskState
     decision: HighDecision
     credit: Credit
-    reached: jax.Array  # bool [..., P], p₊ of the sub-task that was completed
+    reached: Bool[Array, "B P"]  # p₊ of the sub-task that was completed
     next_view: View  # when it was
-    completed: jax.Array  # bool, it was, within the episode and the rollout
+    completed: Bool[Array, " B"]  # it was, within the episode and the rollout

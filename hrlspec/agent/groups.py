@@ -10,13 +10,16 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool
+
+from envs_jax.arrays import Array
 
 Inputs = TypeVar("Inputs")
 Outputs = TypeVar("Outputs")
 
 
 def in_groups(
-    function: Callable[[Inputs], Outputs], needed: jax.Array, inputs: Inputs, outputs: Outputs, group: int
+    function: Callable[[Inputs], Outputs], needed: Bool[Array, " E"], inputs: Inputs, outputs: Outputs, group: int
 ) -> Outputs:
     """Computes ``function`` where it is needed, ``group`` environments at a time.
 
@@ -33,7 +36,7 @@ def in_groups(
     num_envs = needed.shape[0]
     group = min(group, num_envs)
 
-    def body(carry: tuple[jax.Array, Outputs]) -> tuple[jax.Array, Outputs]:
+    def body(carry: tuple[Bool[Array, " E"], Outputs]) -> tuple[Bool[Array, " E"], Outputs]:
         waiting, outputs = carry
         index = jnp.nonzero(waiting, size=group, fill_value=num_envs)[0]
         results = function(jax.tree.map(lambda x: x[jnp.minimum(index, num_envs - 1)], inputs))

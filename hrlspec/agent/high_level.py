@@ -14,7 +14,9 @@ from typing import Any, NamedTuple
 
 import jax
 from flax import struct
+from jaxtyping import Bool, Float32, Int32, Key
 
+from envs_jax.arrays import Array
 from hrlspec.agent.distributions import Categorical
 from hrlspec.agent.experience import Experience, HighBatch, Step, View
 from hrlspec.agent.low_level import LowLevel, Params, TaskBook
@@ -22,33 +24,33 @@ from hrlspec.agent.networks.controller import Instruction
 from hrlspec.config import Config, PPOConfig
 from hrlspec.spec import TaskState, TaskTree
 
-Metrics = dict[str, jax.Array]
+Metrics = dict[str, Float32[Array, ""]]
 
 
 @struct.dataclass
 class Choice:
     """What the high level thinks of the open edges; leading axis B."""
 
-    logits: jax.Array  # float32 [B, N], over edges
-    value: jax.Array  # float32 [B], V^h of the remaining task
-    advice: jax.Array  # float32 [B, N], what the low level said of each edge; zeros where it was not asked
-    ahead: jax.Array  # float32 [B, N, D, P], what would be meant to be reached after each edge
+    logits: Float32[Array, "B N"]  # over edges
+    value: Float32[Array, " B"]  # V^h of the remaining task
+    advice: Float32[Array, "B N"]  # what the low level said of each edge; zeros where it was not asked
+    ahead: Float32[Array, "B N D P"]  # what would be meant to be reached after each edge
 
 
 class Judgement(NamedTuple):
     """What the high level thinks of a choice that something else made; leading axis B."""
 
-    log_prob: jax.Array  # float32 [B]
-    value: jax.Array  # float32 [B]
-    advice: jax.Array  # float32 [B, N]
+    log_prob: Float32[Array, " B"]
+    value: Float32[Array, " B"]
+    advice: Float32[Array, "B N"]
 
 
 class Rewards(NamedTuple):
     """What the low level learns from, leading axes ``[V, T]``."""
 
-    reward: jax.Array  # float32
-    terminated: jax.Array  # bool
-    truncated: jax.Array  # bool
+    reward: Float32[Array, "V T"]
+    terminated: Bool[Array, "V T"]
+    truncated: Bool[Array, "V T"]
 
 
 class HighLevel(abc.ABC):
@@ -81,7 +83,7 @@ class HighLevel(abc.ABC):
         del config
 
     @abc.abstractmethod
-    def init(self, key: jax.Array, low: LowLevel, view: View, tree: TaskTree) -> Any:
+    def init(self, key: Key[Array, ""], low: LowLevel, view: View, tree: TaskTree) -> Any:
         """What ``params["high"]`` begins as: where `ppo` is given, standard deviations of the weights to be drawn.
 
         Args:
@@ -114,7 +116,7 @@ class HighLevel(abc.ABC):
         tree: TaskTree,
         state: TaskState,
         told: Instruction,
-        edge: jax.Array,
+        edge: Int32[Array, " B"],
     ) -> Judgement:
         """What it thinks of choosing ``edge`` (int32 ``[B]``), which relabelling made the task's own path."""
         choice = self.choose(low, params, view, tree, state, told)
@@ -126,7 +128,9 @@ class HighLevel(abc.ABC):
         outcome = experience.outcome
         return Rewards(outcome.reward, outcome.terminated, outcome.truncated)
 
-    def loss(self, low: LowLevel, params: Any, batch: HighBatch, progress: jax.Array) -> tuple[jax.Array, Metrics]:
+    def loss(
+        self, low: LowLevel, params: Any, batch: HighBatch, progress: Float32[Array, ""]
+    ) -> tuple[Float32[Array, ""], Metrics]:
         """Loss of ``params["high"]``, which ``params`` is, on a minibatch; called where `ppo` is given.
 
         Args:

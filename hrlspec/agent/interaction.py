@@ -12,8 +12,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Bool, Float32, Int, Int32, Key, Shaped
 
 from envs_jax import Environment
+from envs_jax.arrays import Array
 from envs_jax.base import Layout, State
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.distributions import Categorical
@@ -43,21 +45,26 @@ class Worker:
 
     env_state: State
     view: View
-    task: jax.Array
+    task: Int32[Array, " E"]
     task_state: TaskState
     decision: HighDecision
-    awaiting: jax.Array
-    rules: jax.Array
+    awaiting: Bool[Array, " E"]
+    rules: Int32[Array, "E R"]
 
 
-def task_of(book: TaskBook, rows: jax.Array) -> TaskTree:
+def task_of(book: TaskBook, rows: Int[Array, " E"]) -> TaskTree:
     """The trees of the given rows of a book."""
     tree: TaskTree = jax.tree.map(lambda x: x[rows], book.tree)
     return tree
 
 
 def start(
-    keys: jax.Array, env: Environment, machine: RewardMachine, book: TaskBook, layouts: Layout, tasks: jax.Array
+    keys: Key[Array, " E"],
+    env: Environment,
+    machine: RewardMachine,
+    book: TaskBook,
+    layouts: Layout,
+    tasks: Int[Array, " E"],
 ) -> Worker:
     """Workers at the start of an episode in the given layouts with the given rows of the book, all leading axis E."""
     observation, env_state = jax.vmap(env.reset_to, in_axes=(0, 0, None))(layouts, keys, env.default_params)
@@ -74,7 +81,12 @@ def start(
 
 
 def decide(
-    agent: Agent, params: Params, book: TaskBook, worker: Worker, needed: jax.Array, noise: jax.Array
+    agent: Agent,
+    params: Params,
+    book: TaskBook,
+    worker: Worker,
+    needed: Bool[Array, " E"],
+    noise: Float32[Array, "E N"],
 ) -> HighDecision:
     """What the high level decides in the environments that need it, and in the others what is in force there.
 
@@ -87,7 +99,7 @@ def decide(
         noise: Gumbel noise ``[E, N]``; zeros choose greedily.
     """
 
-    def choose(inputs: tuple[View, jax.Array, TaskState, jax.Array]) -> HighDecision:
+    def choose(inputs: tuple[View, Int[Array, " B"], TaskState, Float32[Array, "B N"]]) -> HighDecision:
         view, task, state, noise = inputs
         tree, told = jax.tree.map(lambda x: x[task], (book.tree, book.told))
         choice = agent.high.choose(agent.low, params, view, tree, state, told)
@@ -102,17 +114,19 @@ def decide(
     return in_groups(choose, needed, inputs, kept, agent.config.group)
 
 
-def assign(agent: Agent, params: Params, book: TaskBook, worker: Worker, noise: jax.Array) -> Worker:
+def assign(agent: Agent, params: Params, book: TaskBook, worker: Worker, noise: Float32[Array, "E N"]) -> Worker:
     """Assigns a sub-task wherever one is due; see `decide`."""
     decision = decide(agent, params, book, worker, worker.awaiting, noise)
     return dataclasses.replace(worker, decision=decision, awaiting=jnp.zeros_like(worker.awaiting))
 
 
-def act(agent: Agent, params: Params, book: TaskBook, worker: Worker, noise: jax.Array, *, shield: bool) -> LowDecision:
+def act(
+    agent: Agent, params: Params, book: TaskBook, worker: Worker, noise: Float32[Array, "E ..."], *, shield: bool
+) -> LowDecision:
     """Chooses actions for the sub-tasks in force, leading axis E."""
     low = agent.low
 
-    def one(view: View, told: Instruction, noise: jax.Array) -> LowDecision:
+    def one(view: View, told: Instruction, noise: Float32[Array, "*_"]) -> LowDecision:
         outputs, value = low.control(params, view, told)
         action, log_prob = low.actions.sample(outputs, noise)
         safe = shielded_action(low, params, view, told.avoid > 0, action) if shield else action
@@ -125,7 +139,12 @@ def act(agent: Agent, params: Params, book: TaskBook, worker: Worker, noise: jax
 
 
 def transition(
-    keys: jax.Array, env: Environment, machine: RewardMachine, book: TaskBook, worker: Worker, action: jax.Array
+    keys: Key[Array, " E"],
+    env: Environment,
+    machine: RewardMachine,
+    book: TaskBook,
+    worker: Worker,
+    action: Int32[Array, " E"] | Float32[Array, "E A"],
 ) -> tuple[Worker, Outcome]:
     """Steps environments, tasks and bonus rules. Ended episodes are left as they ended."""
     params = env.default_params
@@ -163,14 +182,14 @@ def transition(
     return after, outcome
 
 
-def where(condition: jax.Array, new: Any, old: Any) -> Any:
+def where(condition: Bool[Array, " E"], new: Any, old: Any) -> Any:
     """Leaves of ``new`` in the environments where ``condition`` (bool ``[E]``), of ``old`` in the others."""
 
-    def pick(new: jax.Array, old: jax.Array) -> jax.Array:
+    def pick(new: Shaped[Array, "E ..."], old: Shaped[Array, "E ..."]) -> Shaped[Array, "E ..."]:
         return jnp.where(condition.reshape(condition.shape + (1,) * (new.ndim - 1)), new, old)
 
     return jax.tree.map(pick, new, old)
 
 
-def _views(env: Environment, observation: jax.Array) -> View:
+def _views(env: Environment, observation: Float32[Array, "E ..."]) -> View:
     return jax.vmap(lambda x: view_of(env, x))(observation)

@@ -13,8 +13,10 @@ from typing import Any, cast
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Bool, Float32, Int, Int32
 
 from envs_jax import Environment, Symmetric
+from envs_jax.arrays import Array
 from hrlspec.agent.distributions import Distribution, distribution_over
 from hrlspec.agent.experience import View
 from hrlspec.agent.networks.controller import Controller, Instruction, Sees
@@ -88,10 +90,10 @@ class LowLevel:
         self,
         params: Params,
         told: Instruction,
-        where: tuple[jax.Array, ...],
-        edge: jax.Array,
-        feasible: jax.Array,
-        ahead: jax.Array,
+        where: tuple[Int[Array, "..."], ...],
+        edge: Int32[Array, "*lead"],
+        feasible: Bool[Array, "*lead _"],
+        ahead: Float32[Array, "*lead D P"],
     ) -> Instruction:
         """What the low level is told at single moments.
 
@@ -108,15 +110,17 @@ class LowLevel:
         future = self.controller.apply(params["low"], told.future[where], feasible, method="remaining")
         nothing = jnp.zeros((*edge.shape, told.reach.shape[-1]))
         behind = jnp.zeros((*edge.shape, 0, told.reach.shape[-1]))
-        return Instruction(reach=nothing, avoid=nothing, ahead=ahead, behind=behind, future=cast(jax.Array, future))
+        return Instruction(reach=nothing, avoid=nothing, ahead=ahead, behind=behind, future=cast(Array, future))
 
-    def control(self, params: Params, view: View, told: Instruction) -> tuple[jax.Array, jax.Array]:
+    def control(
+        self, params: Params, view: View, told: Instruction
+    ) -> tuple[Float32[Array, " outputs"], Float32[Array, ""]]:
         """What describes the policy on one environment (see ``actions``), and the value ``[]``."""
-        return cast("tuple[jax.Array, jax.Array]", self.controller.apply(params["low"], view, told))
+        return cast("tuple[Array, Array]", self.controller.apply(params["low"], view, told))
 
     def value_of(
-        self, params: Params, view: View, told: Instruction, edge: jax.Array, feasible: jax.Array
-    ) -> jax.Array:
+        self, params: Params, view: View, told: Instruction, edge: Int[Array, " B"], feasible: Bool[Array, "B N"]
+    ) -> Float32[Array, " B"]:
         """V^l of pursuing an edge in each of B environments, ``[B]``.
 
         Args:
@@ -130,10 +134,12 @@ class LowLevel:
         now = self.told_now(params, told, (rows,), edge, feasible, told.ahead[rows, edge])
         return jax.vmap(self.control, in_axes=(None, 0, 0))(params, view, now)[1]
 
-    def reach_values(self, params: Params, view: View) -> jax.Array:
+    def reach_values(self, params: Params, view: View) -> Float32[Array, "P K"]:
         """Q(s, g, a) of reaching each proposition by each candidate action, float32 ``[P, K]``."""
-        return cast(jax.Array, self.reach_critic.apply(params["reach_critic"], view))
+        return cast(Array, self.reach_critic.apply(params["reach_critic"], view))
 
-    def reach_values_of(self, params: Params, view: View, action: jax.Array) -> jax.Array:
+    def reach_values_of(
+        self, params: Params, view: View, action: Int32[Array, ""] | Float32[Array, " A"]
+    ) -> Float32[Array, " P"]:
         """Q(s, g, a) of reaching each proposition by one action, float32 ``[P]``."""
-        return cast(jax.Array, self.reach_critic.apply(params["reach_critic"], view, action, method="of"))
+        return cast(Array, self.reach_critic.apply(params["reach_critic"], view, action, method="of"))

@@ -5,14 +5,21 @@ Axes: **P** atomic propositions, **A** components of an action.
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float32, Int32
 
+from envs_jax.arrays import Array
 from hrlspec.agent.experience import View
 from hrlspec.agent.low_level import LowLevel, Params
 
 
-def shielded_action(low: LowLevel, params: Params, view: View, avoid: jax.Array, action: jax.Array) -> jax.Array:
+def shielded_action(
+    low: LowLevel,
+    params: Params,
+    view: View,
+    avoid: Bool[Array, " P"],
+    action: Int32[Array, ""] | Float32[Array, " A"],
+) -> Int32[Array, ""] | Float32[Array, " A"]:
     """Replaces the action where a forbidden proposition is near.
 
     With k = argmax over p₋ of V(s, g_k): if V(s, g_k) > ν, the action becomes argmin_a Q(s, g_k, a). Maxima and minima

@@ -9,7 +9,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Int32, Key, Shaped
 
+from envs_jax.arrays import Array
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.experience import Credit, Experience, HighBatch, LowBatch
 from hrlspec.config import PPOConfig
@@ -41,7 +43,7 @@ def low_batch(agent: Agent, x: Experience) -> LowBatch:
     )
 
 
-def high_batch(key: jax.Array, agent: Agent, x: Experience, settings: PPOConfig) -> HighBatch:
+def high_batch(key: Key[Array, ""], agent: Agent, x: Experience, settings: PPOConfig) -> HighBatch:
     """A random subset of the decisions, of fixed size B; when there are fewer, the rest is marked invalid.
 
     Args:
@@ -69,7 +71,7 @@ def high_batch(key: jax.Array, agent: Agent, x: Experience, settings: PPOConfig)
     after = jnp.minimum(end + 1, num_steps - 1)
     over = (outcome.terminated | outcome.truncated)[row, end]
 
-    def at(field: Any, when: jax.Array = time) -> Any:
+    def at(field: Any, when: Int32[Array, " B"] = time) -> Any:
         return jax.tree.map(lambda leaf: leaf[row, when], field)
 
     return HighBatch(
@@ -89,7 +91,7 @@ def high_batch(key: jax.Array, agent: Agent, x: Experience, settings: PPOConfig)
     )
 
 
-def _endings(x: Experience) -> tuple[jax.Array, jax.Array]:
+def _endings(x: Experience) -> tuple[Int32[Array, "V T"], Bool[Array, "V T"]]:
     """For each step the first at or after it that ends a sub-task, int32 ``[V, T]``, and whether it completed it."""
     num_steps = x.valid.shape[1]
     ended = x.outcome.edge_taken | x.outcome.terminated | x.outcome.truncated | jnp.roll(x.high.made, -1, 1)
@@ -98,7 +100,7 @@ def _endings(x: Experience) -> tuple[jax.Array, jax.Array]:
     return last, (end < num_steps) & jnp.take_along_axis(x.outcome.edge_taken, last, 1)
 
 
-def _feasible(agent: Agent, x: Experience) -> jax.Array:
+def _feasible(agent: Agent, x: Experience) -> Bool[Array, "V T _"]:
     """Open edges ``[V, T, N]`` where the low level is told of them, else ``[V, T, 0]``."""
     if agent.method.sees != "whole task":
         return jnp.zeros((*x.slot.shape, 0), bool)
@@ -107,6 +109,6 @@ def _feasible(agent: Agent, x: Experience) -> jax.Array:
     return jax.vmap(jax.vmap(open_edges))(trees, x.state)
 
 
-def _in_time(*arrays: jax.Array) -> tuple[jax.Array, ...]:
+def _in_time(*arrays: Shaped[Array, "V T"]) -> tuple[Shaped[Array, "T V"], ...]:
     """Arrays ``[V, T]`` as ``[T, V]``."""
     return tuple(jnp.swapaxes(array, 0, 1) for array in arrays)

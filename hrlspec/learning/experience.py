@@ -14,7 +14,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Int32, Key, Shaped, UInt32
 
+from envs_jax.arrays import Array
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.experience import Bootstrap, Experience, HighDecision, LowDecision, Outcome, Step, View
 from hrlspec.agent.groups import in_groups
@@ -30,13 +32,13 @@ JUDGED_AT_ONCE = 128
 
 
 def gather(
-    key: jax.Array,
+    key: Key[Array, ""],
     agent: Agent,
     params: Params,
     machine: RewardMachine,
     book: TaskBook,
     steps: Step,
-    reserved: jax.Array,
+    reserved: UInt32[Array, " M"],
 ) -> Experience:
     """A rollout ``[T, E]`` and relabelled copies of a share of its environments. The key is consumed.
 
@@ -86,13 +88,13 @@ def originals(book: TaskBook, rollout: Step, num_slots: int) -> Experience:
 
 
 def copies(
-    keys: jax.Array,
+    keys: Key[Array, " E"],
     agent: Agent,
     params: Params,
     machine: RewardMachine,
     book: TaskBook,
     rollout: Step,
-    reserved: jax.Array,
+    reserved: UInt32[Array, " M"],
 ) -> Experience:
     """Relabelled copies of the given environments' rollouts, with both levels' opinion of them under the new tasks."""
     record = _record(agent, book, rollout)
@@ -168,12 +170,12 @@ def _record(agent: Agent, book: TaskBook, rollout: Step) -> Record:
 
 
 def _relabelled(
-    keys: jax.Array, agent: Agent, machine: RewardMachine, record: Record, reserved: jax.Array
+    keys: Key[Array, " E"], agent: Agent, machine: RewardMachine, record: Record, reserved: UInt32[Array, " M"]
 ) -> Relabelled:
     """The new tasks, leading axis E."""
     config = agent.config
 
-    def one(key: jax.Array, record: Record) -> Relabelled:
+    def one(key: Key[Array, ""], record: Record) -> Relabelled:
         return relabel(
             key,
             record,
@@ -190,7 +192,13 @@ def _relabelled(
 
 
 def _told(
-    agent: Agent, params: Params, fresh: TaskBook, row: jax.Array, edge: jax.Array, node: jax.Array, new: Relabelled
+    agent: Agent,
+    params: Params,
+    fresh: TaskBook,
+    row: Int32[Array, " R"],
+    edge: Int32[Array, " R"],
+    node: Int32[Array, " R"],
+    new: Relabelled,
 ) -> Instruction:
     """What the low level would have been told under the new tasks, leading axis R."""
     tree = fresh.tree
@@ -210,14 +218,14 @@ def _judged(
     params: Params,
     fresh: TaskBook,
     view: View,
-    row: jax.Array,
-    node: jax.Array,
-    edge: jax.Array,
-    decided: jax.Array,
+    row: Int32[Array, " R"],
+    node: Int32[Array, " R"],
+    edge: Int32[Array, " R"],
+    decided: Bool[Array, " R"],
 ) -> Judgement:
     """What the high level thinks of the completed path's choices, leading axis R; zeros where there was none."""
 
-    def judge(inputs: tuple[View, jax.Array, jax.Array, jax.Array]) -> Judgement:
+    def judge(inputs: tuple[View, Array, Array, Array]) -> Judgement:
         view, row, node, edge = inputs
         tree, told = jax.tree.map(lambda x: x[row], (fresh.tree, fresh.told))
         state = dataclasses.replace(jax.vmap(initial)(tree), node=node)
@@ -230,6 +238,6 @@ def _judged(
     return in_groups(judge, decided, (view, row, node, edge), unknown, JUDGED_AT_ONCE)
 
 
-def _flat(x: jax.Array) -> jax.Array:
+def _flat(x: Shaped[Array, "E T ..."]) -> Shaped[Array, "..."]:
     """Merges the two leading axes."""
     return x.reshape((x.shape[0] * x.shape[1], *x.shape[2:]))

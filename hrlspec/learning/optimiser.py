@@ -8,11 +8,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Float32, Int32, Key
 
+from envs_jax.arrays import Array
 from hrlspec.config import OptimiserConfig
 
-Metrics = dict[str, jax.Array]
-Loss = Callable[[Any], tuple[jax.Array, Metrics]]
+Metrics = dict[str, Float32[Array, ""]]
+Loss = Callable[[Any], tuple[Float32[Array, ""], Metrics]]
 
 
 def optimiser(config: OptimiserConfig) -> optax.GradientTransformation:
@@ -23,7 +25,7 @@ def optimiser(config: OptimiserConfig) -> optax.GradientTransformation:
     return optax.flatten(optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)))
 
 
-def annealed(first: float, last: float, progress: jax.Array) -> jax.Array:
+def annealed(first: float, last: float, progress: Float32[Array, ""]) -> Float32[Array, ""]:
     """Linear from ``first`` to ``last`` as ``progress`` goes from 0 to 1."""
     return first + (last - first) * jnp.clip(progress, 0.0, 1.0)
 
@@ -33,7 +35,7 @@ def gradient_step(
     params: Any,
     state: optax.OptState,
     transform: optax.GradientTransformation,
-    learning_rate: jax.Array,
+    learning_rate: Float32[Array, ""],
 ) -> tuple[Any, optax.OptState, Metrics]:
     """One step; a non-finite loss or gradient leaves everything as it was and is counted in ``skipped``."""
     (value, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(params)
@@ -46,13 +48,13 @@ def gradient_step(
 
 
 def fit(
-    key: jax.Array,
-    loss: Callable[[Any, Any], tuple[jax.Array, Metrics]],
+    key: Key[Array, ""],
+    loss: Callable[[Any, Any], tuple[Float32[Array, ""], Metrics]],
     params: Any,
     state: optax.OptState,
     batch: Any,
     config: OptimiserConfig,
-    progress: jax.Array,
+    progress: Float32[Array, ""],
 ) -> tuple[Any, optax.OptState, Metrics]:
     """Epochs of minibatch steps over the leading axis of ``batch``, shuffled anew for each.
 
@@ -78,7 +80,7 @@ def fit(
     rate = annealed(config.learning_rate, config.final_learning_rate, progress)
     shuffled = jnp.argsort(jax.random.bits(key, (config.epochs, size)), axis=-1)
 
-    def step(carry: tuple[Any, Any], rows: jax.Array) -> tuple[tuple[Any, Any], Metrics]:
+    def step(carry: tuple[Any, Any], rows: Int32[Array, " rows"]) -> tuple[tuple[Any, Any], Metrics]:
         sample = jax.tree.map(lambda x: x[rows], batch)
         params, state, metrics = gradient_step(lambda p: loss(p, sample), *carry, transform, rate)
         return (params, state), metrics

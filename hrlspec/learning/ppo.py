@@ -6,38 +6,45 @@ Axes: **B** samples.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float32, Shaped
 
+from envs_jax.arrays import Array
 from hrlspec.agent.experience import Credit, LowBatch
 from hrlspec.agent.low_level import LowLevel
 from hrlspec.config import PPOConfig
 from hrlspec.learning.optimiser import Metrics, annealed
 
 
-def masked_mean(x: jax.Array, mask: jax.Array) -> jax.Array:
+def masked_mean(x: Float32[Array, "*B"], mask: Bool[Array, "*B"]) -> Float32[Array, ""]:
     """Mean of ``x`` where ``mask``; 0 when nothing is."""
     mask = mask.astype(x.dtype)
     return (x * mask).sum() / jnp.maximum(mask.sum(), 1.0)
 
 
-def normalise(advantage: jax.Array, mask: jax.Array) -> jax.Array:
+def normalise(advantage: Float32[Array, " B"], mask: Bool[Array, " B"]) -> Float32[Array, " B"]:
     """Advantages with mean 0 and standard deviation 1 over the masked samples."""
     mean = masked_mean(advantage, mask)
     variance = masked_mean((advantage - mean) ** 2, mask)
     return (advantage - mean) / jnp.sqrt(variance + 1e-8)
 
 
-def scaled(advantage: jax.Array, value: jax.Array, settings: PPOConfig) -> jax.Array:
+def scaled(advantage: Float32[Array, "*B"], value: Float32[Array, "*B"], settings: PPOConfig) -> Float32[Array, "*B"]:
     """Advantages per unit of what was expected: a scale that depends on the state alone, so what is best stays so."""
     scale = settings.advantage_scale
     return advantage / (scale + jnp.abs(value)) if scale else advantage
 
 
 def policy_loss(
-    log_prob: jax.Array, old: jax.Array, advantage: jax.Array, mask: jax.Array, settings: PPOConfig
-) -> jax.Array:
+    log_prob: Float32[Array, " B"],
+    old: Float32[Array, " B"],
+    advantage: Float32[Array, " B"],
+    mask: Bool[Array, " B"],
+    settings: PPOConfig,
+) -> Float32[Array, ""]:
     """Clipped surrogate; ``old`` is what the ratio is taken to.
 
     That is the log-probability with which a sample was drawn; for relabelled ones see `RelabelConfig.corrected`.
@@ -51,12 +58,14 @@ def policy_loss(
     return -masked_mean(surrogate, mask)
 
 
-def value_loss(value: jax.Array, target: jax.Array, mask: jax.Array) -> jax.Array:
+def value_loss(
+    value: Float32[Array, " B"], target: Float32[Array, " B"], mask: Bool[Array, " B"]
+) -> Float32[Array, ""]:
     """Mean squared error."""
     return masked_mean((target - value) ** 2, mask)
 
 
-def entropy_loss(entropy: jax.Array, settings: PPOConfig, progress: jax.Array) -> jax.Array:
+def entropy_loss(entropy: Float32[Array, ""], settings: PPOConfig, progress: Float32[Array, ""]) -> Float32[Array, ""]:
     """Minus the weighted mean entropy, and the square of what it lacks of the floor.
 
     Near the optimum normalised advantages are mostly noise, which drives a policy to certainty; what keeps it from
@@ -70,14 +79,14 @@ def entropy_loss(entropy: jax.Array, settings: PPOConfig, progress: jax.Array) -
 
 
 def loss(
-    log_prob: jax.Array,
-    old: jax.Array,
-    value: jax.Array,
-    entropy: jax.Array,
+    log_prob: Float32[Array, " B"],
+    old: Float32[Array, " B"],
+    value: Float32[Array, " B"],
+    entropy: Float32[Array, " B"],
     credit: Credit,
     settings: PPOConfig,
-    progress: jax.Array,
-) -> tuple[jax.Array, Metrics]:
+    progress: Float32[Array, ""],
+) -> tuple[Float32[Array, ""], Metrics]:
     """The loss of an actor and its critic.
 
     Args:
@@ -95,14 +104,14 @@ def loss(
     advantage = normalise(credit.advantage, credit.learns)
     policy = policy_loss(log_prob, old, advantage, credit.learns, settings)
     critic = value_loss(value, credit.target, credit.valid)
-    entropy = masked_mean(entropy, credit.learns)
-    total = policy + settings.value_coefficient * critic + entropy_loss(entropy, settings, progress)
-    return total, {"policy_loss": policy, "value_loss": critic, "entropy": entropy}
+    randomness = masked_mean(entropy, credit.learns)
+    total = policy + settings.value_coefficient * critic + entropy_loss(randomness, settings, progress)
+    return total, {"policy_loss": policy, "value_loss": critic, "entropy": randomness}
 
 
 def low_level_loss(
-    low: LowLevel, params: jax.Array, batch: LowBatch, settings: PPOConfig, progress: jax.Array
-) -> tuple[jax.Array, Metrics]:
+    low: LowLevel, params: Any, batch: LowBatch, settings: PPOConfig, progress: Float32[Array, ""]
+) -> tuple[Float32[Array, ""], Metrics]:
     """Loss of the low level on a minibatch ``[V, T]``; steps the shield replaced count for the value alone.
 
     Args:
@@ -123,6 +132,6 @@ def low_level_loss(
     return loss(log_prob, decision.log_prob, value, entropy, credit, settings, progress)
 
 
-def flat(x: jax.Array) -> jax.Array:
+def flat(x: Shaped[Array, "V T ..."]) -> Shaped[Array, "..."]:
     """Merges the two leading axes (zero-sized arrays too)."""
     return x.reshape((x.shape[0] * x.shape[1], *x.shape[2:]))

@@ -10,7 +10,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Float32, Int32
 
+from envs_jax.arrays import Array
 from hrlspec.agent.experience import Step, View
 from hrlspec.agent.low_level import LowLevel
 from hrlspec.learning.optimiser import Metrics
@@ -22,8 +24,8 @@ class ReachBatch:
     """Transitions, leading axes ``[E, T]``."""
 
     view: View
-    action: jax.Array
-    target: jax.Array  # float32 [..., P]
+    action: Int32[Array, "E T"] | Float32[Array, "E T A"]
+    target: Float32[Array, "E T P"]
 
 
 def reach_batch(low: LowLevel, steps: Step) -> ReachBatch:
@@ -38,7 +40,7 @@ def reach_batch(low: LowLevel, steps: Step) -> ReachBatch:
     return by_env
 
 
-def reach_loss(low: LowLevel, params: Any, batch: ReachBatch) -> tuple[jax.Array, Metrics]:
+def reach_loss(low: LowLevel, params: Any, batch: ReachBatch) -> tuple[Float32[Array, ""], Metrics]:
     """Mean squared error of Q(s, g, a) over all goals g; ``params`` is ``params["reach_critic"]``."""
     batch = jax.tree.map(flat, batch)
     own = {"reach_critic": params}

@@ -16,7 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Bool, Float32, Int32, Key, Shaped, UInt32
 
+from envs_jax.arrays import Array
 from hrlspec.spec import TaskTree, task_hash
 from hrlspec.tasks import rewards
 from hrlspec.tasks.rewards import RewardMachine
@@ -34,14 +36,14 @@ class Record:
         avoid: bool ``[T, P]``, its ``ensuring`` part.
     """
 
-    slot: jax.Array
-    labels: jax.Array
-    edge_taken: jax.Array
-    reach: jax.Array
-    avoid: jax.Array
+    slot: Int32[Array, "*lead T"]
+    labels: Bool[Array, "*lead T P"]
+    edge_taken: Bool[Array, "*lead T"]
+    reach: Bool[Array, "*lead T P"]
+    avoid: Bool[Array, "*lead T P"]
 
     @property
-    def first(self) -> jax.Array:
+    def first(self) -> Bool[Array, " T"]:
         """Whether the step is the first of its episode in the rollout, bool ``[T]``."""
         return jnp.concatenate([jnp.ones(1, bool), self.slot[1:] != self.slot[:-1]])
 
@@ -62,13 +64,13 @@ class Relabelled:
     """
 
     tree: TaskTree
-    path_length: jax.Array
-    node: jax.Array
-    assigned: jax.Array
-    decided: jax.Array
-    reward: jax.Array
-    terminated: jax.Array
-    valid: jax.Array
+    path_length: Int32[Array, " S"]
+    node: Int32[Array, " T"]
+    assigned: Int32[Array, " T"]
+    decided: Bool[Array, " T"]
+    reward: Float32[Array, " T"]
+    terminated: Bool[Array, " T"]
+    valid: Bool[Array, " T"]
 
 
 def visits(record: Record) -> Record:
@@ -79,7 +81,7 @@ def visits(record: Record) -> Record:
     a region found too rarely is forgotten before it is learned.
     """
 
-    def step(seen: jax.Array, inputs: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    def step(seen: Bool[Array, " P"], inputs: tuple[Array, ...]) -> tuple[Bool[Array, " P"], tuple[Array, ...]]:
         labels, taken, reach, avoid, first = inputs
         seen = seen & ~first
         new = labels & ~seen
@@ -94,10 +96,10 @@ def visits(record: Record) -> Record:
 
 
 def relabel(
-    key: jax.Array,
+    key: Key[Array, ""],
     record: Record,
     machine: RewardMachine,
-    reserved: jax.Array,
+    reserved: UInt32[Array, " M"],
     *,
     num_slots: int,
     max_path: int,
@@ -134,7 +136,7 @@ def relabel(
     decided = valid & (record.first | jnp.concatenate([jnp.zeros(1, bool), record.edge_taken[:-1]]))
     terminated = valid & record.edge_taken & (done_before + 1 == length[slot])
 
-    def pay(rules: jax.Array, step: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+    def pay(rules: Int32[Array, " R"], step: tuple[Array, ...]) -> tuple[Int32[Array, " R"], Float32[Array, ""]]:
         labels, reached, taken, completed, first = step
         rules = jnp.where(first, rewards.initial(machine), rules)
         return rewards.step(machine, rules, labels, reached, taken, completed)
@@ -153,15 +155,15 @@ def relabel(
     )
 
 
-def _completed_before(record: Record) -> jax.Array:
+def _completed_before(record: Record) -> Int32[Array, " T"]:
     """How many sub-tasks its episode had completed before each step, int32 ``[T]``."""
     total = jnp.cumsum(record.edge_taken) - record.edge_taken
     return (total - jax.lax.cummax(jnp.where(record.first, total, 0))).astype(jnp.int32)
 
 
 def _path(
-    record: Record, done_before: jax.Array, num_slots: int, max_path: int
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    record: Record, done_before: Int32[Array, " T"], num_slots: int, max_path: int
+) -> tuple[Int32[Array, " S"], Bool[Array, "S K P"], Bool[Array, "S K P"], Bool[Array, "S K P"]]:
     """The completed path of each slot: length ``[S]``, reach, avoid and the labels seen on the way, ``[S, K, P]``."""
     num_propositions = record.labels.shape[-1]
     empty = jnp.zeros((num_slots, max_path, num_propositions), jnp.int32)
@@ -194,11 +196,11 @@ def branch_lengths(max_path: int, max_nodes: int) -> np.ndarray:
 
 
 def _grow(
-    key: jax.Array,
-    length: jax.Array,
-    path_reach: jax.Array,
-    path_avoid: jax.Array,
-    seen: jax.Array,
+    key: Key[Array, ""],
+    length: Int32[Array, ""],
+    path_reach: Bool[Array, "K P"],
+    path_avoid: Bool[Array, "K P"],
+    seen: Bool[Array, "K P"],
     *,
     max_nodes: int,
     max_avoid: int,
@@ -249,7 +251,7 @@ def _grow(
     nothing = jnp.zeros((1, num_propositions), bool)
     valid = jnp.concatenate([jnp.ones(1, bool), place < length, exists, jnp.zeros(padding, bool)])
 
-    def rows(*parts: Any) -> jax.Array:
+    def rows(*parts: Any) -> Shaped[Array, "..."]:
         x = jnp.concatenate([jnp.asarray(part) for part in parts])
         x = jnp.pad(x, ((0, padding),) + ((0, 0),) * (x.ndim - 1))
         return jnp.where(valid.reshape((-1,) + (1,) * (x.ndim - 1)), x, 0).astype(x.dtype)
@@ -264,7 +266,7 @@ def _grow(
     )
 
 
-def _random_avoid(noise: jax.Array, forbidden: jax.Array, max_avoid: int) -> jax.Array:
+def _random_avoid(noise: Float32[Array, " P_and_1"], forbidden: Bool[Array, " P"], max_avoid: int) -> Bool[Array, " P"]:
     """At most ``max_avoid`` (and P - 2) random propositions outside ``forbidden``, bool ``[P]``; uniform size."""
     num_propositions = forbidden.shape[0]
     most = max(0, min(max_avoid, num_propositions - 2))

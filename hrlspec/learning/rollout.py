@@ -13,8 +13,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Bool, Float32, Int32, Key
 
 from envs_jax import ContestedLayouts
+from envs_jax.arrays import Array
 from envs_jax.base import Layout
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.experience import Bootstrap, HighDecision, Step, View
@@ -30,8 +32,8 @@ class Pool:
     """What the next episodes start with, leading axes ``[E, S]``; environment e takes its S entries in turn."""
 
     layout: Layout
-    task: jax.Array  # int32, row of the task book
-    level: jax.Array  # int32, its curriculum level
+    task: Int32[Array, "*lead S"]  # row of the task book
+    level: Int32[Array, "*lead S"]  # its curriculum level
 
 
 @struct.dataclass
@@ -39,9 +41,9 @@ class Collector:
     """What goes on from one rollout to the next; leading axis E."""
 
     worker: Worker
-    level: jax.Array  # int32 [E], curriculum level of each task
-    started: jax.Array  # int32 [E], episodes started so far, for the pool
-    since: jax.Array  # int32 [E], steps since the sub-task in force was assigned
+    level: Int32[Array, " E"]  # curriculum level of each task
+    started: Int32[Array, " E"]  # episodes started so far, for the pool
+    since: Int32[Array, " E"]  # steps since the sub-task in force was assigned
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,25 +68,25 @@ class Setting:
 class _Chance(NamedTuple):
     """Randomness of one step, leading axis E; of a rollout, leading axes ``[T, E]``."""
 
-    high: jax.Array  # float32 [E, N]
-    low: jax.Array  # float32 [E, ...]
-    keys: jax.Array  # [E]
+    high: Float32[Array, "E N"]
+    low: Float32[Array, "E ..."]
+    keys: Key[Array, " E"]
 
 
-def fill_pool(key: jax.Array, agent: Agent, book: TaskBook, level: jax.Array, size: int) -> Pool:
+def fill_pool(key: Key[Array, ""], agent: Agent, book: TaskBook, level: Int32[Array, ""], size: int) -> Pool:
     """Draws tasks of the curriculum's levels and layouts for them, ``size`` for each environment. The key is consumed.
 
     A share ``contested`` of the layouts is contested, in environments that know how to draw such layouts.
     """
     config, env = agent.config.curriculum, agent.env
 
-    def draw(key: jax.Array, task: jax.Array, wanted: jax.Array) -> Layout:
+    def draw(key: Key[Array, ""], task: Int32[Array, ""], wanted: Bool[Array, ""]) -> Layout:
         if not config.contested or not isinstance(env, ContestedLayouts):
             return env.sample_layout(key, env.default_params)
         first, second = opening(jax.tree.map(lambda x: x[task], book.tree))
         return env.contested_layout(key, first & wanted, second & wanted, env.default_params)
 
-    def one(index: jax.Array) -> Pool:
+    def one(index: Int32[Array, ""]) -> Pool:
         keys = jax.random.split(jax.random.fold_in(key, index), size + 1)
         chance = jax.random.uniform(keys[size], (4, size))
         levels = curriculum.draw_levels(chance[:2], level, config.earlier)
@@ -96,14 +98,14 @@ def fill_pool(key: jax.Array, agent: Agent, book: TaskBook, level: jax.Array, si
     return jax.vmap(one)(jnp.arange(agent.config.num_envs))
 
 
-def opening(tree: TaskTree) -> tuple[jax.Array, jax.Array]:
+def opening(tree: TaskTree) -> tuple[Bool[Array, " P"], Bool[Array, " P"]]:
     """What a task's first edge reaches and what the first edge after it does, bool ``[P]`` each; all false if none."""
     second = (tree.parent == 1) & tree.valid
     return tree.reach[1], tree.reach[jnp.argmax(second)] & second.any()
 
 
 def collect(
-    key: jax.Array, setting: Setting, collector: Collector, correlation: jax.Array | float
+    key: Key[Array, ""], setting: Setting, collector: Collector, correlation: Float32[Array, ""] | float
 ) -> tuple[Collector, Step]:
     """Rolls out E×T steps. Workers come and go with a sub-task in force: decisions are made at the end of a step.
 
@@ -129,11 +131,11 @@ def collect(
     return collector, dataclasses.replace(steps, bootstrap=bootstrap)
 
 
-def _draw(key: jax.Array, agent: Agent, num_nodes: int, correlation: jax.Array | float) -> _Chance:
+def _draw(key: Key[Array, ""], agent: Agent, num_nodes: int, correlation: Float32[Array, ""] | float) -> _Chance:
     """The randomness of a rollout, leading axes ``[T, E]``."""
     num_envs, num_steps = agent.config.num_envs, agent.config.num_steps
 
-    def one(env: jax.Array) -> _Chance:
+    def one(env: Int32[Array, ""]) -> _Chance:
         keys = jax.random.split(jax.random.fold_in(key, env), 3)
         return _Chance(
             jax.random.gumbel(keys[0], (num_steps, num_nodes)),
@@ -145,7 +147,7 @@ def _draw(key: jax.Array, agent: Agent, num_nodes: int, correlation: jax.Array |
     return chance
 
 
-def _step(setting: Setting, collector: Collector, inputs: tuple[_Chance, jax.Array]) -> tuple[Collector, Step]:
+def _step(setting: Setting, collector: Collector, inputs: tuple[_Chance, Bool[Array, ""]]) -> tuple[Collector, Step]:
     """One step of all environments: act, step the worlds, restart what ended, decide what is due."""
     agent, params, book, pool = setting.agent, setting.params, setting.book, setting.pool
     chance, last = inputs
@@ -183,8 +185,13 @@ def _step(setting: Setting, collector: Collector, inputs: tuple[_Chance, jax.Arr
 
 
 def _plan(
-    setting: Setting, after: Worker, ended: Worker, truncated: jax.Array, last: jax.Array, noise: jax.Array
-) -> tuple[HighDecision, jax.Array]:
+    setting: Setting,
+    after: Worker,
+    ended: Worker,
+    truncated: Bool[Array, " E"],
+    last: Bool[Array, ""],
+    noise: Float32[Array, "E N"],
+) -> tuple[HighDecision, Float32[Array, " E"]]:
     """Decisions for the next step, and V^h of the states that this one led to, where they are needed.
 
     One pass of the high level serves the decisions that are due, the values of truncated states, and in the end those
@@ -207,6 +214,6 @@ def _plan(
     return decision, bootstrap
 
 
-def _reach_values(agent: Agent, params: Params, view: View) -> jax.Array:
+def _reach_values(agent: Agent, params: Params, view: View) -> Float32[Array, "E P"]:
     """max_a Q(s, g, a) of each environment and proposition, float32 ``[E, P]``."""
     return jax.vmap(agent.low.reach_values, in_axes=(None, 0))(params, view).max(-1)

@@ -7,21 +7,24 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float32
+
+from envs_jax.arrays import Array
 
 
 def low_level_targets(
-    reward: jax.Array,
-    terminated: jax.Array,
-    truncated: jax.Array,
-    value: jax.Array,
-    bootstrap: jax.Array,
-    decided: jax.Array,
-    high_value: jax.Array,
+    reward: Float32[Array, "T E"],
+    terminated: Bool[Array, "T E"],
+    truncated: Bool[Array, "T E"],
+    value: Float32[Array, "T E"],
+    bootstrap: Float32[Array, "T E"],
+    decided: Bool[Array, "T E"],
+    high_value: Float32[Array, "T E"],
     *,
     discount: float,
     gae_lambda: float,
     max_operator: bool,
-) -> jax.Array:
+) -> Float32[Array, "T E"]:
     """λ-returns ``G_t = r_t + γ[(1−λ)V_{t+1} + λG_{t+1}]`` with the max operator (eq. 6).
 
     At a state where a new sub-task starts, G is raised to the high level's value of what remains:
@@ -46,8 +49,8 @@ def low_level_targets(
     cut = truncated.at[-1].set(True)
 
     def backward(
-        carry: tuple[jax.Array, jax.Array], inputs: tuple[jax.Array, ...]
-    ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+        carry: tuple[Array, Array], inputs: tuple[Array, ...]
+    ) -> tuple[tuple[Array, Array], Float32[Array, " E"]]:
         next_value, next_return = carry
         reward, terminated, cut, value, bootstrap, raised, high_value = inputs
         ahead = (1 - gae_lambda) * next_value + gae_lambda * next_return
@@ -62,16 +65,16 @@ def low_level_targets(
 
 
 def high_level_targets(
-    reward: jax.Array,
-    terminated: jax.Array,
-    truncated: jax.Array,
-    decided: jax.Array,
-    value: jax.Array,
-    bootstrap: jax.Array,
+    reward: Float32[Array, "T E"],
+    terminated: Bool[Array, "T E"],
+    truncated: Bool[Array, "T E"],
+    decided: Bool[Array, "T E"],
+    value: Float32[Array, "T E"],
+    bootstrap: Float32[Array, "T E"],
     *,
     discount: float,
-    gae_lambda: float | jax.Array,
-) -> tuple[jax.Array, jax.Array]:
+    gae_lambda: float | Float32[Array, "T E"],
+) -> tuple[Float32[Array, "T E"], Float32[Array, "T E"]]:
     """SMDP generalised advantages of the high level's decisions.
 
     For a decision at t whose successor is at t' the reward is ``R = Σ γ^{τ−t} r_τ`` and the bootstrap
@@ -94,8 +97,8 @@ def high_level_targets(
     cut = truncated.at[-1].set(True)
 
     def backward(
-        carry: tuple[jax.Array, jax.Array], inputs: tuple[jax.Array, ...]
-    ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+        carry: tuple[Array, Array], inputs: tuple[Array, ...]
+    ) -> tuple[tuple[Array, Array], Float32[Array, " E"]]:
         ahead, advantage_ahead = carry
         reward, terminated, cut, decided, value, bootstrap, gae_lambda = inputs
         ahead = jnp.where(cut, bootstrap, ahead)

@@ -12,7 +12,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Float32, Int32, Key, UInt32
 
+from envs_jax.arrays import Array
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.experience import Experience, Step
 from hrlspec.agent.interaction import start
@@ -48,8 +50,8 @@ class TrainState:
     collector: Collector
     tasks: TaskTree
     curriculum: Curriculum
-    key: jax.Array
-    iteration: jax.Array
+    key: Key[Array, ""]
+    iteration: Int32[Array, ""]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +67,7 @@ class Trainer:
     agent: Agent
 
     @functools.partial(jax.jit, static_argnums=0)
-    def init(self, key: jax.Array, bank: TaskTree, machine: RewardMachine) -> TrainState:
+    def init(self, key: Key[Array, ""], bank: TaskTree, machine: RewardMachine) -> TrainState:
         """A fresh state. The key is consumed."""
         config = self.agent.config
         key, init_key, *start_keys = jax.random.split(key, 5)
@@ -84,7 +86,7 @@ class Trainer:
 
     @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
     def iterate(
-        self, state: TrainState, bank: TaskTree, machine: RewardMachine, reserved: jax.Array
+        self, state: TrainState, bank: TaskTree, machine: RewardMachine, reserved: UInt32[Array, " M"]
     ) -> tuple[TrainState, Metrics]:
         """One iteration: E×T steps of collection, then updates of all parts. ``state`` is donated.
 
@@ -126,14 +128,14 @@ class Trainer:
         return new_state, losses | _summary(steps) | {"level": 1.0 + state.curriculum.level}
 
     def _first_collector(
-        self, keys: list[jax.Array], params: Params, tasks: TaskTree, machine: RewardMachine
+        self, keys: list[Key[Array, ""]], params: Params, tasks: TaskTree, machine: RewardMachine
     ) -> Collector:
         """Running episodes with staggered clocks; those that fail at first would otherwise all end in the same step."""
         agent, env = self.agent, self.agent.env
         envs = jnp.arange(agent.config.num_envs)
         layout_key, reset_key, stagger_key = keys
 
-        def each(key: jax.Array) -> jax.Array:
+        def each(key: Key[Array, ""]) -> Key[Array, " E"]:
             return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, envs)
 
         layouts = jax.vmap(env.sample_layout, in_axes=(0, None))(each(layout_key), env.default_params)
@@ -161,12 +163,12 @@ class Trainer:
 
     def _learn(
         self,
-        key: jax.Array,
-        pick_key: jax.Array,
+        key: Key[Array, ""],
+        pick_key: Key[Array, ""],
         state: TrainState,
         experience: Experience,
         steps: Step,
-        progress: jax.Array,
+        progress: Float32[Array, ""],
     ) -> tuple[Params, dict[str, Any], Metrics]:
         """Updates all parts that learn by gradient; metrics are means over the gradient steps."""
         agent, config, ppo = self.agent, self.agent.config, self.agent.high.ppo

@@ -10,7 +10,9 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Key
 
+from envs_jax.arrays import Array
 from hrlspec.agent.distributions import MASKED
 from hrlspec.agent.experience import View
 from hrlspec.agent.high_level import Choice, HighLevel
@@ -25,7 +27,7 @@ from hrlspec.spec import TaskState, TaskTree, open_edges
 class NoChoice(Checked, HighLevel):
     """Assigns nothing: the policy may take any edge. V^h is the value of the one policy there is."""
 
-    def init(self, key: jax.Array, low: LowLevel, view: View, tree: TaskTree) -> Any:
+    def init(self, key: Key[Array, ""], low: LowLevel, view: View, tree: TaskTree) -> Any:
         """Nothing is learned."""
         del key, low, view, tree
         return {}

@@ -17,7 +17,9 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Bool, Float32, Int, Int32, Key
 
+from envs_jax.arrays import Array
 from hrlspec.agent.distributions import MASKED
 from hrlspec.agent.experience import Experience, Step, View
 from hrlspec.agent.high_level import Choice, HighLevel, Rewards
@@ -41,10 +43,10 @@ class Measurements:
         rewards: float32 ``[2, P]``, of what they earned.
     """
 
-    attempts: jax.Array
-    discounted: jax.Array
-    successes: jax.Array
-    rewards: jax.Array
+    attempts: Float32[Array, "O P"]
+    discounted: Float32[Array, "O P"]
+    successes: Float32[Array, "2 P"]
+    rewards: Float32[Array, "2 P"]
 
 
 def unmeasured(num_propositions: int) -> Measurements:
@@ -56,13 +58,13 @@ def unmeasured(num_propositions: int) -> Measurements:
 
 def measure(
     known: Measurements,
-    origin: jax.Array,
-    goal: jax.Array,
-    ended: jax.Array,
-    reached: jax.Array,
-    last: jax.Array,
-    duration: jax.Array,
-    reward: jax.Array,
+    origin: Bool[Array, "T E O"],
+    goal: Bool[Array, "T E P"],
+    ended: Bool[Array, "T E"],
+    reached: Bool[Array, "T E"],
+    last: Bool[Array, "T E"],
+    duration: Int[Array, "T E"],
+    reward: Float32[Array, "T E"],
     *,
     discount: float,
     fading: float,
@@ -85,10 +87,10 @@ def measure(
     success = ended & reached
     kinds = jnp.stack([success & ~last, success & last]).astype(jnp.float32)
 
-    def pairs(weight: jax.Array) -> jax.Array:
+    def pairs(weight: Float32[Array, "T E"]) -> Float32[Array, "O P"]:
         return jnp.einsum("te,teo,teg->og", weight, origin, goal)
 
-    def goals(weight: jax.Array) -> jax.Array:
+    def goals(weight: Float32[Array, "2 T E"]) -> Float32[Array, "2 P"]:
         return jnp.einsum("kte,teg->kg", weight, goal)
 
     return Measurements(
@@ -99,13 +101,13 @@ def measure(
     )
 
 
-def origins(tree: TaskTree) -> jax.Array:
+def origins(tree: TaskTree) -> Bool[Array, "N O"]:
     """Where a sub-task out of each node begins, bool ``[N, O]``: at what the node reached, or at the start."""
     start = jnp.arange(tree.num_nodes) == TaskTree.ROOT
     return jnp.concatenate([tree.reach, start[:, None]], -1)
 
 
-def values(known: Measurements, tree: TaskTree, state: TaskState) -> jax.Array:
+def values(known: Measurements, tree: TaskTree, state: TaskState) -> Float32[Array, " N"]:
     """Logic value iteration: the discounted reward expected of each open edge and the best way on, float32 ``[N]``.
 
     ``Q(q, e) = D_e (R_e + max_e' Q(q', e'))`` with the measured E[γ^duration] D_e and reward R_e; -inf on other nodes.
@@ -120,7 +122,7 @@ def values(known: Measurements, tree: TaskTree, state: TaskState) -> jax.Array:
     reward = jnp.where(tree.reach, per_success[:, None], -jnp.inf).max(-1)
     reward = jnp.where(tree.accepting, reward[1], reward[0])
 
-    def visit(best: jax.Array, node: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def visit(best: Float32[Array, " N"], node: Int32[Array, ""]) -> tuple[Float32[Array, " N"], Float32[Array, ""]]:
         ahead = jnp.where(tree.accepting[node], 0.0, best[node])
         value = jnp.where(tree.edges[node], reach[node] * (reward[node] + ahead), -jnp.inf)
         return best.at[tree.parent[node]].max(value), value
@@ -139,7 +141,7 @@ class LogicValueIteration(Checked, HighLevel):
     fading: float = setting(0.98, least=0, most=1)
     """What is left of a measurement's weight an iteration later: options change while they are learned."""
 
-    def init(self, key: jax.Array, low: LowLevel, view: View, tree: TaskTree) -> Measurements:
+    def init(self, key: Key[Array, ""], low: LowLevel, view: View, tree: TaskTree) -> Measurements:
         """See :class:`HighLevel`."""
         del key, low, view
         return unmeasured(tree.num_propositions)

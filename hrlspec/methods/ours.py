@@ -11,7 +11,9 @@ from typing import Any, ClassVar, cast
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float32, Int32, Key
 
+from envs_jax.arrays import Array
 from hrlspec.agent.distributions import MASKED, Categorical
 from hrlspec.agent.experience import HighBatch, View
 from hrlspec.agent.groups import in_groups
@@ -72,7 +74,7 @@ class ImplicitPlanner(Checked, HighLevel):
         """The networks; a subclass that gives others of the same methods plans with them."""
         return Planner(self.network, low.config.network)
 
-    def init(self, key: jax.Array, low: LowLevel, view: View, tree: TaskTree) -> Any:
+    def init(self, key: Key[Array, ""], low: LowLevel, view: View, tree: TaskTree) -> Any:
         """See :class:`HighLevel`."""
         state = TaskState(jnp.int32(0), jnp.zeros(tree.num_nodes, bool), jnp.int32(0))
         return self.planner(low).init(key, view, tree, state, jnp.zeros(tree.num_nodes))
@@ -83,7 +85,7 @@ class ImplicitPlanner(Checked, HighLevel):
         """See :class:`HighLevel`."""
         advice, ahead = self.advise(low, params, view, tree, state, told)
         plan = jax.vmap(self.planner(low).apply, in_axes=(None, 0, 0, 0, 0))
-        logits, value = cast("tuple[jax.Array, jax.Array]", plan(params["high"], view, tree, state, advice))
+        logits, value = cast("tuple[Array, Array]", plan(params["high"], view, tree, state, advice))
         return Choice(logits, value, advice, ahead)
 
     def judge(
@@ -94,7 +96,7 @@ class ImplicitPlanner(Checked, HighLevel):
         tree: TaskTree,
         state: TaskState,
         told: Instruction,
-        edge: jax.Array,
+        edge: Int32[Array, " B"],
     ) -> Judgement:
         """See :class:`HighLevel`.
 
@@ -107,7 +109,7 @@ class ImplicitPlanner(Checked, HighLevel):
 
     def advise(
         self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
-    ) -> tuple[jax.Array, jax.Array]:
+    ) -> tuple[Float32[Array, "B N"], Float32[Array, "B N D P"]]:
         """The low level's advice in B environments: its value of each feasible edge and the best path on to a leaf.
 
         Zeros, and what all paths have in common, where the configuration gives advice no weight.
@@ -124,7 +126,7 @@ class ImplicitPlanner(Checked, HighLevel):
         edge, known, paths = jax.vmap(self._paths, in_axes=(None, 0, 0, 0))(low, tree, state, told)
         num_paths = known.shape[1]
 
-        def value(inputs: tuple[jax.Array, Instruction]) -> jax.Array:
+        def value(inputs: tuple[Int32[Array, " G"], Instruction]) -> Float32[Array, " G"]:
             env, path = inputs
             seen = jax.tree.map(lambda x: x[env], view)
             return jax.vmap(low.control, in_axes=(None, 0, 0))(params, seen, path)[1]
@@ -136,12 +138,14 @@ class ImplicitPlanner(Checked, HighLevel):
         advice, ahead = jax.vmap(_best_paths)(edge, known, values.reshape(known.shape), paths.ahead, told.ahead)
         return jax.lax.stop_gradient(advice), ahead
 
-    def loss(self, low: LowLevel, params: Any, batch: HighBatch, progress: jax.Array) -> tuple[jax.Array, Metrics]:
+    def loss(
+        self, low: LowLevel, params: Any, batch: HighBatch, progress: Float32[Array, ""]
+    ) -> tuple[Float32[Array, ""], Metrics]:
         """PPO and TransE loss on a minibatch ``[B]`` (eqs. 4 and 5)."""
         planner = self.planner(low)
         decision = batch.decision
         logits, value = cast(
-            "tuple[jax.Array, jax.Array]",
+            "tuple[Array, Array]",
             jax.vmap(planner.apply, in_axes=(None, 0, 0, 0, 0))(
                 params, batch.view, batch.tree, batch.state, decision.advice
             ),
@@ -163,14 +167,14 @@ class ImplicitPlanner(Checked, HighLevel):
             loss = loss + self.transe * metrics["transe_loss"]
         return loss, metrics
 
-    def transe_loss(self, planner: Planner, params: Any, batch: HighBatch) -> jax.Array:
+    def transe_loss(self, planner: Planner, params: Any, batch: HighBatch) -> Float32[Array, ""]:
         """Predicted latents near the ones reached, other states' latents at least the margin away (eq. 4)."""
 
-        def encode(view: View) -> jax.Array:
-            return jax.vmap(lambda v: cast(jax.Array, planner.apply(params, v, method="encode")))(view)
+        def encode(view: View) -> Float32[Array, "B latent"]:
+            return jax.vmap(lambda v: cast(Array, planner.apply(params, v, method="encode")))(view)
 
         here, there = encode(batch.view), encode(batch.next_view)
-        predict = jax.vmap(lambda h, r: cast(jax.Array, planner.apply(params, h, r, method="predict")))
+        predict = jax.vmap(lambda h, r: cast(Array, planner.apply(params, h, r, method="predict")))
         error = _distance(predict(here, batch.reached), there)
         other = _distance(here, jnp.roll(here, 1, axis=0))
         valid = batch.credit.valid
@@ -180,7 +184,7 @@ class ImplicitPlanner(Checked, HighLevel):
 
     def _paths(
         self, low: LowLevel, tree: TaskTree, state: TaskState, told: Instruction
-    ) -> tuple[jax.Array, jax.Array, Instruction]:
+    ) -> tuple[Int32[Array, " L"], Bool[Array, " L"], Instruction]:
         """The paths open in one environment: first edges ``[L]``, which of them exist ``[L]``, and instructions."""
         num_nodes = tree.num_nodes
         path = routes(tree, state.node, 1 + told.ahead.shape[1])
@@ -194,8 +198,12 @@ class ImplicitPlanner(Checked, HighLevel):
 
 
 def _best_paths(
-    edge: jax.Array, known: jax.Array, values: jax.Array, path_ahead: jax.Array, told_ahead: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+    edge: Int32[Array, " L"],
+    known: Bool[Array, " L"],
+    values: Float32[Array, " L"],
+    path_ahead: Float32[Array, "L D P"],
+    told_ahead: Float32[Array, "N D P"],
+) -> tuple[Float32[Array, " N"], Float32[Array, "N D P"]]:
     """From values of paths ``[L]`` to each edge's best value ``[N]`` and what lies ahead on its best path."""
     mine = (edge == jnp.arange(told_ahead.shape[0])[:, None]) & known
     score = jnp.where(mine, values, -jnp.inf)
@@ -204,7 +212,7 @@ def _best_paths(
     return advice, jnp.where(mine.any(1)[:, None, None], path_ahead[score.argmax(1)], told_ahead)
 
 
-def _distance(x: jax.Array, y: jax.Array) -> jax.Array:
+def _distance(x: Float32[Array, "B latent"], y: Float32[Array, "B latent"]) -> Float32[Array, " B"]:
     """Euclidean distance over the last axis, with a finite gradient at zero."""
     return jnp.sqrt(((x - y) ** 2).sum(-1) + 1e-8)
 

@@ -11,7 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Float32, Int, Int32
 
+from envs_jax.arrays import Array
 from hrlspec.config import CurriculumConfig
 from hrlspec.spec import TaskTree
 from hrlspec.tasks.sampling import sample_sequences, sample_trees
@@ -27,9 +29,9 @@ class Curriculum:
         succeeded: int32 ``[]``, those that satisfied their task.
     """
 
-    level: jax.Array
-    finished: jax.Array
-    succeeded: jax.Array
+    level: Int32[Array, ""]
+    finished: Int32[Array, ""]
+    succeeded: Int32[Array, ""]
 
 
 def initial() -> Curriculum:
@@ -37,7 +39,9 @@ def initial() -> Curriculum:
     return Curriculum(level=jnp.int32(0), finished=jnp.int32(0), succeeded=jnp.int32(0))
 
 
-def update(curriculum: Curriculum, finished: jax.Array, succeeded: jax.Array, config: CurriculumConfig) -> Curriculum:
+def update(
+    curriculum: Curriculum, finished: Int[Array, ""], succeeded: Int[Array, ""], config: CurriculumConfig
+) -> Curriculum:
     """Counts finished episodes of the current level; after a full window, promotes or starts a new window."""
     finished, succeeded = curriculum.finished + finished, curriculum.succeeded + succeeded
     verdict = finished >= config.window
@@ -49,7 +53,7 @@ def update(curriculum: Curriculum, finished: jax.Array, succeeded: jax.Array, co
     )
 
 
-def draw_levels(chance: jax.Array, level: jax.Array, earlier: float) -> jax.Array:
+def draw_levels(chance: Float32[Array, "2 S"], level: Int32[Array, ""], earlier: float) -> Int32[Array, " S"]:
     """Levels of the next tasks: the current one, or with probability ``earlier`` one already passed.
 
     Args:

@@ -11,10 +11,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Bool, Float32, Int32
+
+from envs_jax.arrays import Array
 
 
 class Bonus(NamedTuple):
@@ -44,12 +46,12 @@ class RewardMachine:
     PAID: ClassVar[int] = 2
     DEAD: ClassVar[int] = 3
 
-    completion: jax.Array  # float32 []
-    subtask: jax.Array  # float32 []
-    first: jax.Array  # int32 [R]
-    second: jax.Array  # int32 [R]
-    avoid: jax.Array  # bool [R, P]
-    bonus: jax.Array  # float32 [R]
+    completion: Float32[Array, ""]
+    subtask: Float32[Array, ""]
+    first: Int32[Array, " R"]
+    second: Int32[Array, " R"]
+    avoid: Bool[Array, "R P"]
+    bonus: Float32[Array, " R"]
 
     @property
     def num_rules(self) -> int:
@@ -83,19 +85,19 @@ def reward_machine(
     )
 
 
-def initial(machine: RewardMachine) -> jax.Array:
+def initial(machine: RewardMachine) -> Int32[Array, " R"]:
     """Every rule waiting, int32 ``[R]``."""
     return jnp.full(machine.num_rules, RewardMachine.WAITING, jnp.int32)
 
 
 def step(
     machine: RewardMachine,
-    rules: jax.Array,
-    labels: jax.Array,
-    reached: jax.Array,
-    edge_taken: jax.Array,
-    completed: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
+    rules: Int32[Array, " R"],
+    labels: Bool[Array, " P"],
+    reached: Bool[Array, " P"],
+    edge_taken: Bool[Array, ""],
+    completed: Bool[Array, ""],
+) -> tuple[Int32[Array, " R"], Float32[Array, ""]]:
     """One step of the reward.
 
     Args:

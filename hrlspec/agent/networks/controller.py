@@ -13,9 +13,11 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Bool, Float32
 
 from envs_jax import Reflections, Symmetries
-from hrlspec.agent.networks.encoder import MLP, Encoder
+from envs_jax.arrays import Array
+from hrlspec.agent.networks.encoder import MLP, Encoder, Planes, Shared
 from hrlspec.agent.networks.symmetry import reflect, turn
 from hrlspec.agent.networks.tree import TaskEmbedding, lookahead, lookback
 from hrlspec.config import NetworkConfig
@@ -35,11 +37,11 @@ class Instruction:
             sub-task is assigned.
     """
 
-    reach: jax.Array
-    avoid: jax.Array
-    ahead: jax.Array
-    behind: jax.Array
-    future: jax.Array
+    reach: Float32[Array, "*lead P"]
+    avoid: Float32[Array, "*lead P"]
+    ahead: Float32[Array, "*lead D P"]
+    behind: Float32[Array, "*lead C P"]
+    future: Float32[Array, "*lead F"]
 
 
 Sees = Literal["future", "sub-task", "whole task"]
@@ -91,11 +93,15 @@ class Controller(nn.Module):
             told = dataclasses.replace(told, ahead=jnp.zeros_like(told.ahead), future=jnp.zeros_like(told.future))
         return told
 
-    def remaining(self, messages: jax.Array, edges: jax.Array) -> jax.Array:
+    def remaining(
+        self, messages: Float32[Array, "*lead N F"], edges: Bool[Array, "*lead N"]
+    ) -> Float32[Array, "*lead F"]:
         """Embedding of what remains while some edges are open (bool ``[..., N]``), ``[..., F]``."""
         return self.task_embedding.of_edges(messages, edges)
 
-    def __call__(self, view: tuple[jax.Array, jax.Array], told: Instruction) -> tuple[jax.Array, jax.Array]:
+    def __call__(
+        self, view: tuple[Planes, Shared], told: Instruction
+    ) -> tuple[Float32[Array, " outputs"], Float32[Array, ""]]:
         """Acts on one sub-task.
 
         Args:
@@ -123,11 +129,13 @@ class Controller(nn.Module):
             outputs = outputs * jnp.concatenate([signs, jnp.ones(self.num_outputs - len(signs))])
         return outputs, self.critic(x)[0]
 
-    def everything(self, view: tuple[jax.Array, jax.Array], tree: TaskTree) -> tuple[jax.Array, jax.Array]:
+    def everything(
+        self, view: tuple[Planes, Shared], tree: TaskTree
+    ) -> tuple[Float32[Array, " outputs"], Float32[Array, ""]]:
         """Touches every parameter, for initialisation."""
         return self(view, jax.tree.map(lambda x: x[0], self.instruct(tree)))
 
-    def _by_role(self, planes: jax.Array, told: Instruction) -> jax.Array:
+    def _by_role(self, planes: Planes, told: Instruction) -> Float32[Array, "R ..."]:
         """What is seen of the goal, of what to avoid and of what lies ahead, ``[R, ...]``.
 
         By role the encoder need not push the whole observation through its latent to find the goal afterwards.
@@ -135,7 +143,7 @@ class Controller(nn.Module):
         roles = jnp.tensordot(jnp.concatenate([told.reach[None], told.avoid[None], told.ahead]), planes, axes=1)
         return jnp.concatenate([roles, planes]) if self.config.names else roles
 
-    def _of_task(self, told: Instruction) -> tuple[jax.Array, jax.Array]:
+    def _of_task(self, told: Instruction) -> tuple[Float32[Array, " _"], Float32[Array, " F"]]:
         """What is told of the sub-task and of what comes before it, scaled, and the embedding of what remains."""
         future = self.task_embedding.of_sequence(told.ahead) if self.follows_plan else told.future
         told_now = self.config.task_scale * jnp.concatenate([told.reach, told.avoid, *told.behind])

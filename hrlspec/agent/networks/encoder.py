@@ -9,19 +9,27 @@ import flax.linen as nn
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
+from jaxtyping import Float, Float32, Key
+
+from envs_jax.arrays import Array
+
+Planes = Float32[Array, "G ..."]
+"""What is seen of each of G propositions or roles: images ``[G, H, W]`` or vectors ``[G, L]``."""
+Shared = Float32[Array, " F0"]
+"""What is seen and belongs to none of them."""
 
 
 def initializer(gain: float) -> nn.initializers.Initializer:
     """Standard deviations of the weights of a layer that scales its input by ``gain``; see :func:`randomised`."""
 
-    def deviation(key: Any, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
+    def deviation(key: Any, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Float32[Array, "..."]:
         del key
         return jnp.full(shape, gain / shape[0] ** 0.5, dtype)
 
     return deviation
 
 
-def randomised(key: jax.Array, deviations: Any) -> Any:
+def randomised(key: Key[Array, ""], deviations: Any) -> Any:
     """Truncated normal weights with the given standard deviations, a pytree; zeros stay zeros. The key is consumed.
 
     One draw serves all layers: with one for each, compiling this would take longer than the rest of a run's start.
@@ -41,7 +49,7 @@ class MLP(nn.Module):
     final_scale: float | None = None
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float32[Array, "*lead _"]) -> Float32[Array, "*lead _out"]:
         """Maps ``[..., F]`` to ``[..., features[-1]]``."""
         for i, width in enumerate(self.features):
             last = i == len(self.features) - 1
@@ -52,10 +60,10 @@ class MLP(nn.Module):
         return x
 
 
-Layer = tuple[jax.Array, jax.Array]  # weights and bias
+Layer = tuple[Float[Array, "_ _"], Float[Array, " _"]]  # weights and bias
 
 
-def patches(x: jax.Array) -> jax.Array:
+def patches(x: Float[Array, "C H W ..."]) -> Float[Array, "..."]:
     """All 2x2 patches of images, ``[C, H, W, ...]`` to ``[4C, H-1, W-1, ...]``.
 
     A 2x2 convolution is then one matrix product. Inside a scanned loop the gradient of XLA's own
@@ -65,7 +73,7 @@ def patches(x: jax.Array) -> jax.Array:
 
 
 @jax.custom_batching.custom_vmap
-def convolve(image: jax.Array, layers: Sequence[Layer]) -> jax.Array:
+def convolve(image: Float[Array, "C H W"], layers: Sequence[Layer]) -> Float[Array, " F"]:
     """2x2 convolutions with ReLU, stride 1.
 
     Args:
@@ -79,7 +87,7 @@ def convolve(image: jax.Array, layers: Sequence[Layer]) -> jax.Array:
 
 
 @convolve.def_vmap
-def _vmapped(size: int, batched: Any, image: jax.Array, layers: Sequence[Layer]) -> tuple[jax.Array, bool]:
+def _vmapped(size: int, batched: Any, image: Float[Array, "..."], layers: Any) -> tuple[Float[Array, "B F"], bool]:
     """With the batch last, patches are long copies instead of a few numbers each: an update takes an eighth less."""
     del size
     if any(jax.tree.leaves(batched[1])):
@@ -88,7 +96,7 @@ def _vmapped(size: int, batched: Any, image: jax.Array, layers: Sequence[Layer])
     return _convolve(jnp.moveaxis(image, 0, -1), layers).T, True
 
 
-def _convolve(x: jax.Array, layers: Sequence[Layer]) -> jax.Array:
+def _convolve(x: Float[Array, "C H W B"], layers: Sequence[Layer]) -> Float[Array, "F B"]:
     """Images ``[C, H, W, B]`` to features ``[F, B]``."""
     for weights, bias in layers:
         x = patches(x)
@@ -112,7 +120,7 @@ class Encoder(nn.Module):
     mlp: Sequence[int]
 
     @nn.compact
-    def __call__(self, planes: jax.Array, shared: jax.Array) -> jax.Array:
+    def __call__(self, planes: Planes, shared: Shared) -> Float32[Array, " latent"]:
         """Encodes one observation.
 
         Args:

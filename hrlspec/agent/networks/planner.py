@@ -8,11 +8,12 @@ from __future__ import annotations
 import dataclasses
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float32, Int32
 
+from envs_jax.arrays import Array
 from hrlspec.agent.distributions import MASKED
-from hrlspec.agent.networks.encoder import MLP, Encoder, initializer
+from hrlspec.agent.networks.encoder import MLP, Encoder, Planes, Shared, initializer
 from hrlspec.agent.networks.tree import sum_to_parents, sweep_up
 from hrlspec.config import Checked, NetworkConfig, setting
 from hrlspec.spec import TaskState, TaskTree, open_edges, subtask_avoid
@@ -62,28 +63,32 @@ class Planner(nn.Module):
         self.policy = MLP((*c.policy, 1), final_scale=0.01)
         self.value = MLP((c.hidden, c.hidden, 1), tanh=True, final_scale=1.0)
 
-    def encode(self, view: tuple[jax.Array, jax.Array]) -> jax.Array:
+    def encode(self, view: tuple[Planes, Shared]) -> Float32[Array, " latent"]:
         """Latent of one observation, float32 ``[latent]``."""
         return self.encoder(*view)
 
-    def predict(self, latent: jax.Array, reach: jax.Array) -> jax.Array:
+    def predict(self, latent: Float32[Array, " latent"], reach: Bool[Array, " P"]) -> Float32[Array, " latent"]:
         """Latent after completing a sub-task, ``h + T(h, p₊)``."""
         return latent + self.transition(jnp.concatenate([latent, reach.astype(latent.dtype)], -1))
 
-    def latent_tree(self, latent: jax.Array, tree: TaskTree, root: jax.Array) -> jax.Array:
+    def latent_tree(
+        self, latent: Float32[Array, " latent"], tree: TaskTree, root: Int32[Array, ""]
+    ) -> Float32[Array, "N latent"]:
         """Forward pass: predicted latents of every node below ``root``, ``[N, latent]``; meaningless elsewhere.
 
         Nodes come in topological order, so each is computed once, from its parent.
         """
 
-        def expand(self: Planner, latents: jax.Array, node: jax.Array) -> tuple[jax.Array, None]:
+        def expand(
+            self: Planner, latents: Float32[Array, "N latent"], node: Int32[Array, ""]
+        ) -> tuple[Float32[Array, "N latent"], None]:
             child = self.predict(latents[tree.parent[node]], tree.reach[node])
             return latents.at[node].set(jnp.where(node == root, latent, child)), None
 
         scan = nn.scan(expand, variable_broadcast="params", split_rngs={"params": False})
         return scan(self, jnp.zeros((tree.num_nodes, latent.shape[-1])), jnp.arange(tree.num_nodes))[0]
 
-    def embed(self, latents: jax.Array, tree: TaskTree, state: TaskState) -> jax.Array:
+    def embed(self, latents: Float32[Array, "N latent"], tree: TaskTree, state: TaskState) -> Float32[Array, "N F"]:
         """Backward pass: messages flow from children to parents over reversed edges (eq. 3), ``[N, F]``.
 
         A blocked edge sends no message.
@@ -94,7 +99,9 @@ class Planner(nn.Module):
         x = self.project(latents)
         if not self.config.rounds:
 
-            def visit(self: Planner, incoming: jax.Array, node: jax.Array) -> tuple[jax.Array, jax.Array]:
+            def visit(
+                self: Planner, incoming: Float32[Array, "N F"], node: Int32[Array, ""]
+            ) -> tuple[Float32[Array, "N F"], Float32[Array, " F"]]:
                 parent = tree.parent[node]
                 here = self.update(jnp.concatenate([x[node], goal[node], incoming[node]]))
                 sent = jnp.concatenate([here, goal[node], x[parent], goal[parent], edge[node]])
@@ -110,8 +117,8 @@ class Planner(nn.Module):
         return x
 
     def __call__(
-        self, view: tuple[jax.Array, jax.Array], tree: TaskTree, state: TaskState, advice: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+        self, view: tuple[Planes, Shared], tree: TaskTree, state: TaskState, advice: Float32[Array, " N"]
+    ) -> tuple[Float32[Array, " N"], Float32[Array, ""]]:
         """Chooses among the open edges and estimates the return of the remaining task.
 
         Args:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
+from jaxtyping import Float32, Int32
 
+from envs_jax.arrays import Array
 from hrlspec.agent.distributions import Categorical, Distribution
-from hrlspec.agent.networks.encoder import MLP
+from hrlspec.agent.networks.encoder import MLP, Planes, Shared
 
 
 class ReachCritic(nn.Module):
@@ -27,13 +28,13 @@ class ReachCritic(nn.Module):
         discrete = isinstance(self.actions, Categorical)
         self.network = MLP((*self.hidden, self.actions.num_outputs if discrete else 1), final_scale=0.1)
 
-    def __call__(self, view: tuple[jax.Array, jax.Array]) -> jax.Array:
+    def __call__(self, view: tuple[Planes, Shared]) -> Float32[Array, "P K"]:
         """Q values of every goal and candidate action, float32 ``[P, K]``."""
         if isinstance(self.actions, Categorical):
             return nn.sigmoid(self.network(_goals(view)))
         return jnp.stack([self.of(view, action) for action in self.actions.candidates()], -1)
 
-    def of(self, view: tuple[jax.Array, jax.Array], action: jax.Array) -> jax.Array:
+    def of(self, view: tuple[Planes, Shared], action: Int32[Array, ""] | Float32[Array, " A"]) -> Float32[Array, " P"]:
         """Q values of every goal and one action, float32 ``[P]``."""
         if isinstance(self.actions, Categorical):
             return self(view)[:, action]
@@ -42,7 +43,7 @@ class ReachCritic(nn.Module):
         return nn.sigmoid(self.network(jnp.concatenate([goals, actions], -1)))[:, 0]
 
 
-def _goals(view: tuple[jax.Array, jax.Array]) -> jax.Array:
+def _goals(view: tuple[Planes, Shared]) -> Float32[Array, "P F"]:
     """What the network sees of each goal: its part of the observation, the shared part, and its one-hot code."""
     planes, shared = view
     num_propositions = planes.shape[0]

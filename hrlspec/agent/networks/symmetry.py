@@ -11,11 +11,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float32, Int32, Shaped
 
 from envs_jax import Reflections, Symmetries
+from envs_jax.arrays import Array
 
 
-def turn(planes: jax.Array, symmetries: Symmetries, lookahead: int) -> tuple[jax.Array, jax.Array]:
+def turn(
+    planes: Float32[Array, "R H H"], symmetries: Symmetries, lookahead: int
+) -> tuple[Float32[Array, "R H H"], Int32[Array, " A"]]:
     """Turns images by role so that the goal, and then what comes after it, lies in one sector.
 
     Args:
@@ -36,15 +40,15 @@ def turn(planes: jax.Array, symmetries: Symmetries, lookahead: int) -> tuple[jax
     # One select after the other: to gather by an index that is computed takes longer. The barrier keeps XLA from
     # computing what the images are made of anew in each branch of each select.
     planes = jax.lax.optimization_barrier(planes)
-    for which in np.eye(3, dtype=bool):
-        wanted = jnp.asarray([bool((bits & which).any()) for bits in np.array(TURNS)])[best]
+    for which in np.eye(3, dtype=bool).tolist():
+        wanted = jnp.asarray([bool((bits & np.array(which)).any()) for bits in np.array(TURNS)])[best]
         planes = jnp.where(wanted, turned(planes, *which), planes)
     return planes, jnp.asarray(symmetries.actions, jnp.int32)[best]
 
 
 def reflect(
-    planes: jax.Array, shared: jax.Array, reflections: Reflections, lookahead: int
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+    planes: Float32[Array, "R L"], shared: Float32[Array, " F0"], reflections: Reflections, lookahead: int
+) -> tuple[Float32[Array, "R L"], Float32[Array, " F0"], Float32[Array, " A"]]:
     """Reflects vectors by role so that the agent moves forward, and at rest towards what comes after the goal.
 
     Were it the goal first, the nearest of its instances would nearly always be right; see `sector_weights`.
@@ -65,7 +69,7 @@ def reflect(
     moves = np.array(reflections.signs, np.float32) * np.array(reflections.heading, np.float32)
     best = jnp.argmax(weights @ (0.05 * planes[0] + after) + (shared[np.array(reflections.shared)] * moves).sum(-1))
 
-    def chosen(rows: Any) -> jax.Array:
+    def chosen(rows: Any) -> Shaped[Array, "..."]:
         return jnp.asarray(np.array(rows))[best]
 
     planes = planes[:, chosen(orders)]
@@ -83,7 +87,7 @@ def turned(image: Any, transpose: bool, rows: bool, columns: bool) -> Any:
     return image[..., ::-1] if columns else image
 
 
-def sector_weights(size: int) -> np.ndarray:
+def sector_weights(size: int) -> Float32[np.ndarray, " cells"]:
     """Weights ``[size²]`` that fall with the distance from the middle, and for equal distance prefer a sector."""
     rows, columns = np.divmod(np.arange(size**2), size)
     down, right = rows - size // 2, columns - size // 2

@@ -11,12 +11,16 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float32, Int32
 
+from envs_jax.arrays import Array
 from hrlspec.agent.networks.encoder import initializer
 from hrlspec.spec import TaskTree
 
 
-def sum_to_parents(messages: jax.Array, parent: jax.Array, sends: jax.Array) -> jax.Array:
+def sum_to_parents(
+    messages: Float32[Array, "N F"], parent: Int32[Array, " N"], sends: Bool[Array, " N"]
+) -> Float32[Array, "N F"]:
     """Sum of the messages ``[N, F]`` that arrive at each node, ``[N, F]``; nodes where ``sends`` is false send none."""
     return jnp.zeros_like(messages).at[parent].add(jnp.where(sends[:, None], messages, 0.0))
 
@@ -40,7 +44,7 @@ def sweep_up(visit: Callable[..., Any], module: nn.Module, carry: Any) -> Any:
     return scan(module, carry, jnp.arange(num_nodes))[1]
 
 
-def lookahead(tree: TaskTree, depth: int) -> jax.Array:
+def lookahead(tree: TaskTree, depth: int) -> Bool[Array, "N D P"]:
     """What may be reached 1, 2, ... sub-tasks after each node, over all branches, bool ``[N, depth, P]``."""
     ahead = []
     reach = tree.reach.astype(jnp.float32)
@@ -50,7 +54,7 @@ def lookahead(tree: TaskTree, depth: int) -> jax.Array:
     return jnp.stack(ahead, 1) if ahead else jnp.zeros((tree.num_nodes, 0, tree.num_propositions), bool)
 
 
-def lookback(tree: TaskTree, depth: int) -> jax.Array:
+def lookback(tree: TaskTree, depth: int) -> Bool[Array, "N D P"]:
     """What was reached 1, 2, ... sub-tasks before each edge, bool ``[N, depth, P]``; nothing before the first."""
     behind = []
     node = tree.parent
@@ -60,7 +64,7 @@ def lookback(tree: TaskTree, depth: int) -> jax.Array:
     return jnp.stack(behind, 1) if behind else jnp.zeros((tree.num_nodes, 0, tree.num_propositions), bool)
 
 
-def routes(tree: TaskTree, node: jax.Array, length: int) -> jax.Array:
+def routes(tree: TaskTree, node: Int32[Array, ""], length: int) -> Int32[Array, "N length"]:
     """The way from ``node`` to every node below it: its first ``length`` nodes, int32 ``[N, length]``.
 
     ``NO_NODE`` stands where the way has ended, and everywhere for nodes that are not below.
@@ -68,7 +72,7 @@ def routes(tree: TaskTree, node: jax.Array, length: int) -> jax.Array:
     place = jnp.arange(length)
     nothing = jnp.full((tree.num_nodes, length), TaskTree.NO_NODE, jnp.int32)
 
-    def climb(_: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def climb(_: Any, carry: Any) -> tuple[Int32[Array, " N"], Int32[Array, "N length"]]:
         here, way = carry
         steps = tree.depth[here] - tree.depth[node] - 1
         way = jnp.where(place == steps[:, None], here[:, None], way)
@@ -102,7 +106,7 @@ class TaskEmbedding(nn.Module):
         self.message = nn.Dense(self.features, use_bias=False, kernel_init=initializer(1.0))
         self.edge = nn.Dense(self.features, use_bias=False, kernel_init=initializer(1.0))
 
-    def __call__(self, tree: TaskTree) -> jax.Array:
+    def __call__(self, tree: TaskTree) -> Float32[Array, "N F"]:
         """Embeds all progressions of one task, float32 ``[N, F]``."""
         if not self.rounds:
             return self._sweep(tree)[0]
@@ -113,33 +117,37 @@ class TaskEmbedding(nn.Module):
             x = nn.tanh(self.own(x) + sum_to_parents(nn.tanh(self.message(x) + edge), tree.parent, sends))
         return x
 
-    def messages(self, tree: TaskTree) -> jax.Array:
+    def messages(self, tree: TaskTree) -> Float32[Array, "N F"]:
         """What the task beyond each edge has to say, float32 ``[N, F]``; `of_edges` reads it."""
         return self._sweep(tree)[1]
 
-    def of_edges(self, messages: jax.Array, edges: jax.Array) -> jax.Array:
+    def of_edges(
+        self, messages: Float32[Array, "*lead N F"], edges: Bool[Array, "*lead N"]
+    ) -> Float32[Array, "*lead F"]:
         """Embeds the task that begins with some edges (bool ``[..., N]``) of one node, ``[..., F]``."""
         return nn.tanh(self.own(jnp.zeros(self.features)) + (messages * edges[..., None]).sum(-2))
 
-    def _edge(self, tree: TaskTree) -> jax.Array:
+    def _edge(self, tree: TaskTree) -> Float32[Array, "N F"]:
         parts = [tree.reach, tree.avoid] if self.negatives else [tree.reach]
         return self.edge(jnp.concatenate(parts, -1).astype(jnp.float32))
 
-    def _sweep(self, tree: TaskTree) -> tuple[jax.Array, jax.Array]:
+    def _sweep(self, tree: TaskTree) -> tuple[Float32[Array, "N F"], Float32[Array, "N F"]]:
         """Embeddings of all progressions, and the message sent along each edge, ``[N, F]`` each."""
         sends = tree.edges
         edge = self._edge(tree)
         nothing = jnp.zeros((tree.num_nodes, self.features))
         bias = self.own(nothing[0])
 
-        def visit(module: TaskEmbedding, incoming: jax.Array, node: jax.Array) -> tuple[jax.Array, Any]:
+        def visit(
+            module: TaskEmbedding, incoming: Float32[Array, "N F"], node: Int32[Array, ""]
+        ) -> tuple[Float32[Array, "N F"], Any]:
             here = nn.tanh(bias + incoming[node])
             sent = nn.tanh(module.message(here) + edge[node]) * sends[node]
             return incoming.at[tree.parent[node]].add(sent), (here, sent)
 
         return sweep_up(visit, self, nothing)
 
-    def of_sequence(self, ahead: jax.Array) -> jax.Array:
+    def of_sequence(self, ahead: Float32[Array, "D P"]) -> Float32[Array, " F"]:
         """Embeds a sequence of sub-tasks as the sweep would, ``[F]``; p₊ is ``[D, P]``, empty rows after its end."""
         bias = self.own(jnp.zeros(self.features))
         x = nn.tanh(bias)
