@@ -9,6 +9,7 @@ import dataclasses
 import functools
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -84,7 +85,8 @@ def run_episodes(
     Returns:
         numpy arrays, leading axis B.
     """
-    total = jax.tree.leaves(trees)[0].shape[0]
+    chex.assert_equal_shape_prefix(jax.tree.leaves((trees, layouts)), 1)
+    total = trees.parent.shape[0]
     chunk = min(chunk, total)
     parts = []
     for first in range(0, total, chunk):

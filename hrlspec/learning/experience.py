@@ -10,7 +10,6 @@ nodes, **P** atomic propositions, **R** rows: V·T steps one after the other.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -99,45 +98,17 @@ def copies(
     """Relabelled copies of the given environments' rollouts, with both levels' opinion of them under the new tasks."""
     record = _record(agent, book, rollout)
     new = _relabelled(keys, agent, machine, record, reserved)
-    shape = rollout.episode.shape
     slot = jnp.minimum(rollout.episode, new.tree.parent.shape[1] - 1)
-    row = (jnp.arange(shape[0])[:, None] * new.tree.parent.shape[1] + slot).reshape(-1)
-    fresh = agent.low.open_book(params, jax.tree.map(_flat, new.tree))
-    view, edge, node = jax.tree.map(_flat, (rollout.view, new.assigned, new.node))
-    told = _told(agent, params, fresh, row, edge, node, new)
-    outputs, value = jax.vmap(agent.low.control, in_axes=(None, 0, 0))(params, view, told)
-    log_prob = jax.vmap(agent.low.actions.log_prob)(outputs, _flat(rollout.low.action))
-    judgement = _judged(agent, params, fresh, view, row, node, edge, _flat(new.decided))
-
-    def shaped(x: Any) -> Any:
-        return jax.tree.map(lambda leaf: leaf.reshape((*shape, *leaf.shape[1:])), x)
-
-    nothing, no = jnp.zeros_like(new.reward), jnp.zeros_like(new.valid)
-    corrected = agent.config.relabel.corrected
+    high, low = _opinions(agent, params, rollout, new, slot)
+    shape, nothing = slot.shape, jnp.zeros_like(new.reward)
+    blocked = jnp.zeros((*shape, new.tree.num_nodes), bool)
     return Experience(
         trees=new.tree,
         slot=slot,
         view=rollout.view,
-        state=TaskState(
-            node=new.node,
-            blocked=jnp.zeros((*shape, new.tree.num_nodes), bool),
-            status=jnp.full(shape, RUNNING, jnp.int32),
-        ),
-        high=HighDecision(
-            made=new.decided,
-            edge=new.assigned,
-            ahead=shaped(told.ahead),
-            # The path was no choice: its probability counts relative to 1.
-            log_prob=nothing if corrected else shaped(judgement.log_prob),
-            value=shaped(judgement.value),
-            advice=shaped(judgement.advice),
-        ),
-        low=LowDecision(
-            action=rollout.low.action,
-            log_prob=rollout.low.log_prob if corrected else shaped(log_prob),
-            value=shaped(value),
-            shielded=rollout.low.shielded,
-        ),
+        state=TaskState(node=new.node, blocked=blocked, status=jnp.full(shape, RUNNING, jnp.int32)),
+        high=high,
+        low=low,
         outcome=Outcome(
             labels=rollout.outcome.labels,
             node=new.assigned,
@@ -145,7 +116,7 @@ def copies(
             satisfied=new.terminated,
             reward=new.reward,
             terminated=new.terminated | ~new.valid,
-            truncated=no,
+            truncated=jnp.zeros_like(new.valid),
         ),
         bootstrap=Bootstrap(low=nothing, high=nothing),
         goal=record.reach,
@@ -154,6 +125,40 @@ def copies(
         learns_high=jnp.full_like(new.valid, agent.high.learns_from_copies),
         valid=new.valid,
     )
+
+
+def _opinions(
+    agent: Agent, params: Params, rollout: Step, new: Relabelled, slot: Int32[Array, "E T"]
+) -> tuple[HighDecision, LowDecision]:
+    """What both levels think, under the new tasks, of what was done."""
+    row = (jnp.arange(slot.shape[0])[:, None] * new.tree.parent.shape[1] + slot).reshape(-1)
+    fresh = agent.low.open_book(params, jax.tree.map(_flat, new.tree))
+    view, edge, node = jax.tree.map(_flat, (rollout.view, new.assigned, new.node))
+    told = _told(agent, params, fresh, row, edge, node, new)
+    outputs, value = jax.vmap(agent.low.control, in_axes=(None, 0, 0))(params, view, told)
+    log_prob = jax.vmap(agent.low.actions.log_prob)(outputs, _flat(rollout.low.action))
+    judgement = _judged(agent, params, fresh, view, row, node, edge, _flat(new.decided))
+
+    def shaped(x: Shaped[Array, "R ..."]) -> Shaped[Array, "E T ..."]:
+        return x.reshape((*slot.shape, *x.shape[1:]))
+
+    corrected = agent.config.relabel.corrected
+    high = HighDecision(
+        made=new.decided,
+        edge=new.assigned,
+        ahead=shaped(told.ahead),
+        # The path was no choice: its probability counts relative to 1.
+        log_prob=jnp.zeros_like(new.reward) if corrected else shaped(judgement.log_prob),
+        value=shaped(judgement.value),
+        advice=shaped(judgement.advice),
+    )
+    low = LowDecision(
+        action=rollout.low.action,
+        log_prob=rollout.low.log_prob if corrected else shaped(log_prob),
+        value=shaped(value),
+        shielded=rollout.low.shielded,
+    )
+    return high, low
 
 
 def _record(agent: Agent, book: TaskBook, rollout: Step) -> Record:

@@ -227,21 +227,10 @@ def _grow(
     wanted = jnp.floor(chance[1] * limit).astype(jnp.int32) + 1
     wanted = jnp.where(grows, jnp.minimum(wanted, limit), 0)
 
-    before = jnp.concatenate([jnp.zeros((1, num_propositions), bool), path_reach[:-1]])
-    excluded, exists = seen | before | path_reach, jnp.ones(max_path, bool)
-    reach, alive, forbidden = [], [], []
-    for j in range(rounds):
-        exists = exists & (j < wanted) & ~excluded.all(-1)
-        choice = jnp.argmax(jnp.where(excluded, -1.0, lottery[j]), -1)
-        goal = (jnp.arange(num_propositions) == choice[:, None]) & exists[:, None]
-        reach.append(goal)
-        alive.append(exists)
-        forbidden.append(goal | before)
-        excluded = before = goal
     # The branches, place by place along the path, as rows after the path's own.
     owner = np.repeat(place, longest)
     offset = np.concatenate([np.arange(n) for n in longest])
-    goal, exists, taboo = (jnp.stack(x)[offset, owner] for x in (reach, alive, forbidden))
+    goal, exists, taboo = (x[offset, owner] for x in _branches(lottery, wanted, path_reach, seen))
     ends = exists & ~jnp.append(exists & (offset > 0), False)[1:]
     avoid = jax.vmap(lambda n, f: _random_avoid(n, f, max_avoid))(noise, taboo) & exists[:, None]
 
@@ -264,6 +253,32 @@ def _grow(
         valid=valid,
         depth=rows(np.zeros(1), place + 1, owner + 1 + offset).astype(jnp.int32),
     )
+
+
+def _branches(
+    lottery: Float32[Array, "J K P"],
+    wanted: Int32[Array, " K"],
+    path_reach: Bool[Array, "K P"],
+    seen: Bool[Array, "K P"],
+) -> tuple[Bool[Array, "J K P"], Bool[Array, "J K"], Bool[Array, "J K P"]]:
+    """A branch at each node of the path, sub-task by sub-task: goals, whether they exist, and what they cannot avoid.
+
+    The first goal is none of the labels seen, of what was reached before and of what the path reaches; no goal is the
+    one before it.
+    """
+    num_propositions = path_reach.shape[1]
+    before = jnp.concatenate([jnp.zeros((1, num_propositions), bool), path_reach[:-1]])
+    excluded, exists = seen | before | path_reach, jnp.ones(path_reach.shape[0], bool)
+    reach, alive, forbidden = [], [], []
+    for j in range(lottery.shape[0]):
+        exists = exists & (j < wanted) & ~excluded.all(-1)
+        choice = jnp.argmax(jnp.where(excluded, -1.0, lottery[j]), -1)
+        goal = (jnp.arange(num_propositions) == choice[:, None]) & exists[:, None]
+        reach.append(goal)
+        alive.append(exists)
+        forbidden.append(goal | before)
+        excluded = before = goal
+    return jnp.stack(reach), jnp.stack(alive), jnp.stack(forbidden)
 
 
 def _random_avoid(noise: Float32[Array, " P_and_1"], forbidden: Bool[Array, " P"], max_avoid: int) -> Bool[Array, " P"]:

@@ -9,6 +9,7 @@ import dataclasses
 import functools
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -70,6 +71,7 @@ class Trainer:
     def init(self, key: Key[Array, ""], bank: TaskTree, machine: RewardMachine) -> TrainState:
         """A fresh state. The key is consumed."""
         config = self.agent.config
+        self._check(bank)
         key, init_key, *start_keys = jax.random.split(key, 5)
         params = self.agent.init(init_key)
         rows = jnp.arange(config.num_envs) % config.curriculum.tasks_per_level
@@ -101,6 +103,9 @@ class Trainer:
             ``returns`` is the sum of its rewards; ``violations`` and ``shielded`` per step, the level, and losses.
         """
         agent, config = self.agent, self.agent.config
+        self._check(bank)
+        chex.assert_rank(reserved, 1)
+        chex.assert_type(reserved, jnp.uint32)
         progress = state.iteration / config.num_iterations
         keys = jax.random.split(jax.random.fold_in(state.key, state.iteration), 5)
         book = agent.low.open_book(state.params, jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank))
@@ -126,6 +131,11 @@ class Trainer:
             iteration=state.iteration + 1,
         )
         return new_state, losses | _summary(steps) | {"level": 1.0 + state.curriculum.level}
+
+    def _check(self, bank: TaskTree) -> None:
+        """Raises ``AssertionError`` unless these are as many tasks of the size that the settings ask for."""
+        config, num_propositions = self.agent.config.curriculum, self.agent.env.num_propositions
+        chex.assert_shape(bank.reach, (config.levels * config.tasks_per_level, config.max_nodes, num_propositions))
 
     def _first_collector(
         self, keys: list[Key[Array, ""]], params: Params, tasks: TaskTree, machine: RewardMachine
