@@ -1,1 +1,1 @@
-"""Letter: the world, its contested layouts and its pictures."""
+"""Letter: the world and its contested layouts."""

@@ -16,8 +16,19 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs_jax.base import Box, ContestedLayouts, Discrete, EnvParams, FiniteGraph, StepResult, Symmetric, Symmetries
+from envs_jax.base import (
+    Box,
+    ContestedLayouts,
+    Discrete,
+    Drawable,
+    EnvParams,
+    FiniteGraph,
+    StepResult,
+    Symmetric,
+    Symmetries,
+)
 from envs_jax.letter.contested import most_contested, myopia_regret
+from envs_jax.scenes import GridScene
 
 NO_LETTER = -1
 MOVES = np.array([[-1, 0], [1, 0], [0, -1], [0, 1]], np.int32)
@@ -49,7 +60,7 @@ class LetterState:
 
 
 @dataclasses.dataclass(frozen=True)
-class Letter(Symmetric, FiniteGraph, ContestedLayouts):
+class Letter(Symmetric, FiniteGraph, ContestedLayouts, Drawable):
     """The Letter world.
 
     Layout: int8 ``[n, n]``; ``num_cells / num_letters`` cells for each letter, placed uniformly over the cells
@@ -250,6 +261,15 @@ class Letter(Symmetric, FiniteGraph, ContestedLayouts):
     def graph_state(self, state: LetterState) -> jax.Array:
         """The agent's cell as a state of :meth:`transition_table`, int32 ``[]``."""
         return state.position[0] * self.size + state.position[1]
+
+    def scene(self, layout: Any) -> GridScene:
+        """The grid of letters."""
+        letters = np.asarray(layout).tolist()
+        return GridScene(tuple(tuple(self.propositions[i] if i >= 0 else "" for i in row) for row in letters))
+
+    def position(self, state: LetterState) -> jax.Array:
+        """Row and column, int32 ``[2]``."""
+        return state.position
 
     def _place_letters(self, key: jax.Array) -> jax.Array:
         """Letters on uniformly drawn cells other than (0, 0), int8 ``[n, n]``.

@@ -1,1 +1,1 @@
-"""Walk: the world, its contested layouts and its pictures."""
+"""Walk: the world."""

@@ -16,7 +16,8 @@ import numpy as np
 from flax import struct
 from scipy import ndimage
 
-from envs_jax.base import Box, EnvParams, GridMap, StepResult
+from envs_jax.base import Box, Drawable, EnvParams, GridMap, StepResult
+from envs_jax.scenes import DiscScene, Region
 
 NO_DISC = -1.0
 """Radius of the entries that pad a proposition with fewer discs than others."""
@@ -82,7 +83,7 @@ class WalkState:
 
 
 @dataclasses.dataclass(frozen=True)
-class Walk(GridMap):
+class Walk(GridMap, Drawable):
     """The Walk world: a square, round regions that may overlap, a point that moves where it is told.
 
     Only the position is observed, so an agent has to learn where the regions are: they are the same in every episode
@@ -257,6 +258,21 @@ class Walk(GridMap):
         edge = self.high + tolerance * self.step_size
         places = np.stack(np.meshgrid(x, y, indexing="ij"), -1)
         return _labels(layout.discs, places), (x <= edge)[:, None] & (y <= edge), behind.astype(int)
+
+    def scene(self, layout: WalkLayout) -> DiscScene:
+        """The regions in the square."""
+        discs = np.asarray(layout.discs)
+        regions = [
+            Region(name, *(float(number) for number in discs[:, i, k]))
+            for i, name in enumerate(self.propositions)
+            for k in range(discs.shape[2])
+            if discs[2, i, k] > 0
+        ]
+        return DiscScene(tuple(regions), self.low, self.high)
+
+    def position(self, state: WalkState) -> jax.Array:
+        """The point, float32 ``[2]``, x and y."""
+        return state.position
 
     def _layout(self) -> Any:
         """The environment's own layout (numpy), with the square's corner for a start that is still to be drawn."""

@@ -1,1 +1,1 @@
-"""Zone: the world, its contested layouts and its pictures."""
+"""Zone: the world, its physics, and its layouts."""

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs_jax.base import Box, ContestedChoice, EnvParams, Reflections, StepResult, Symmetric
+from envs_jax.base import Box, ContestedChoice, Drawable, EnvParams, Reflections, StepResult, Symmetric
+from envs_jax.scenes import DiscScene, Region
 from envs_jax.zone import physics as zone_physics
 from envs_jax.zone.contested import contested_layout
 from envs_jax.zone.layouts import COLOURS, ZONES_EACH, ZoneLayout, new_layout
@@ -50,7 +51,7 @@ class ZoneState:
 
 
 @dataclasses.dataclass(frozen=True)
-class Zone(Symmetric, ContestedChoice):
+class Zone(Symmetric, ContestedChoice, Drawable):
     """The Zone world.
 
     Layout: a `ZoneLayout`, the robot's pose and two zones of each colour. Observation: float32 ``[80]``:
@@ -253,6 +254,19 @@ class Zone(Symmetric, ContestedChoice):
         end = NUM_SENSORS + len(COLOURS) * LIDAR_BINS
         lidar = observation[NUM_SENSORS:end].reshape(len(COLOURS), LIDAR_BINS)
         return lidar, jnp.concatenate([observation[:NUM_SENSORS] * SENSOR_SCALE, observation[end:]])
+
+    def scene(self, layout: ZoneLayout) -> DiscScene:
+        """The zones in the square."""
+        regions = [
+            Region(name, float(centre[0]), float(centre[1]), self.radius)
+            for name, some in zip(COLOURS, np.asarray(layout.zones), strict=True)
+            for centre in some
+        ]
+        return DiscScene(tuple(regions), -BOUNDARY, BOUNDARY)
+
+    def position(self, state: ZoneState) -> jax.Array:
+        """The robot, float ``[3]``: x, y (m) and heading (rad)."""
+        return state.body[:3]
 
     @property
     def _physics_step(self) -> zone_physics.Step:

@@ -6,6 +6,7 @@ Axes: **B** episodes, **H** horizon.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,11 +18,15 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
-from hrlspec.agent.agent import Agent, Params
+from envs_jax import Drawable, Environment
+from envs_jax.base import Layout, State
+from envs_jax.scenes import Leg, Scene
+from hrlspec.agent.agent import Agent
+from hrlspec.agent.low_level import Params
 from hrlspec.evaluation import Suite
 from hrlspec.evaluation.cases import draw_layouts
-from hrlspec.evaluation.episodes import trace_episodes
-from hrlspec.run.stages import Leg, Stage, position_of, stage_of
+from hrlspec.evaluation.episodes import Episodes, Trace, trace_episodes
+from hrlspec.run.timeline import Timeline
 from hrlspec.spec import RUNNING, SATISFIED, VIOLATED, TaskState, TaskTree, draw_task, subtasks
 from hrlspec.tasks.rewards import RewardMachine
 
@@ -64,8 +69,8 @@ class Episode:
     Attributes:
         formula: the task.
         tree: the same, unbatched.
-        stage: where it took place.
-        positions: ``[t + 1, 2 or more]``, where the agent was, the end included.
+        scene: where it took place.
+        positions: ``[t + 1, D]``, where the agent was in the scene, the end included.
         nodes: int ``[t + 1]``, where the task stood.
         assigned: int ``[t]``, the edge in force at each step.
         success: the task was satisfied.
@@ -74,7 +79,7 @@ class Episode:
 
     formula: str
     tree: TaskTree
-    stage: Stage
+    scene: Scene
     positions: np.ndarray
     nodes: np.ndarray
     assigned: np.ndarray
@@ -111,7 +116,7 @@ class Episode:
 def examples(
     key: jax.Array, agent: Agent, params: Params, machine: RewardMachine, suite: Suite, folder: Path
 ) -> list[Path]:
-    """Lets an agent carry out one task of each depth and draws it; only for environments that have pictures.
+    """Lets an agent carry out one task of each depth and draws it.
 
     Args:
         key: consumed.
@@ -131,50 +136,68 @@ def examples(
     files: list[Path] = []
     names = agent.env.propositions
     shown = episodes_of(key, agent, params, machine, suite.take(rows))
-    for depth, episode in zip(depths, shown, strict=False):
+    for depth, episode in zip(depths, shown, strict=True):
         files += [folder / f"example_{depth}.png", folder / f"task_{depth}.png"]
         trajectory(episode, names, files[-2])
         task_graph(episode, names, files[-1])
-    return [*files, animation(shown[-1], names, folder / "episode.gif")] if shown else []
+    return [*files, animation(shown[-1], names, folder / "episode.gif")]
 
 
 def episodes_of(key: jax.Array, agent: Agent, params: Params, machine: RewardMachine, suite: Suite) -> list[Episode]:
-    """One episode of each task of a suite, each in a layout of its own, actions sampled; none without pictures."""
+    """One episode of each task of a suite, each in a layout of its own, actions sampled."""
     layouts = draw_layouts(agent.env, suite, 1)
-    stages = [stage_of(agent.env, jax.tree.map(lambda x, i=i: x[i], layouts)) for i in range(len(suite))]
-    if None in stages:
-        return []
-    episodes, trace = trace_episodes(key, agent, params, machine, suite.trees, layouts)
-    positions = position_of(trace.env_state)
+    ended, trace = trace_episodes(key, agent, params, machine, suite.trees, layouts)
     found = []
-    for i, (formula, stage) in enumerate(zip(suite.formulas, stages, strict=True)):
-        # Entry t is the state before step t, so the one after the last step is there unless the horizon came first.
-        end = min(int(episodes.steps[i]) + 1, len(trace.node))
-        tree: TaskTree = jax.tree.map(lambda x, i=i: x[i], suite.trees)
-        assert stage is not None
-        found.append(
-            Episode(
-                formula=formula,
-                tree=tree,
-                stage=stage,
-                positions=positions[:end, i],
-                nodes=np.asarray(trace.node)[:end, i],
-                assigned=np.asarray(trace.assigned)[: end - 1, i],
-                success=bool(episodes.success[i]),
-                violated=bool(episodes.violated[i]),
-            )
-        )
+    for i, formula in enumerate(suite.formulas):
+        tree, layout, end = jax.tree.map(lambda x, i=i: x[i], (suite.trees, layouts, ended))
+        found.append(episode_of(agent.env, formula, tree, layout, end, trace, i))
     return found
+
+
+def episode_of(
+    env: Environment, formula: str, tree: TaskTree, layout: Layout, ended: Episodes, trace: Trace, index: int
+) -> Episode:
+    """One of the episodes of a trace, for drawing.
+
+    Args:
+        env: the environment.
+        formula: the task.
+        tree: the same, unbatched.
+        layout: where it took place, unbatched (numpy).
+        ended: how it ended, unbatched.
+        trace: what happened in B episodes.
+        index: which of them it is.
+    """
+    # Entry t is the state before step t, so the one after the last step is there unless the horizon came first.
+    end = min(int(ended.steps) + 1, len(trace.node))
+    positions = _positions(env, jax.tree.map(lambda x: x[:, index], trace.env_state))
+    return Episode(
+        formula=formula,
+        tree=tree,
+        scene=env.scene(layout) if isinstance(env, Drawable) else Timeline(env.propositions),
+        positions=np.asarray(positions)[:end],
+        nodes=np.asarray(trace.node)[:end, index],
+        assigned=np.asarray(trace.assigned)[: end - 1, index],
+        success=bool(ended.success),
+        violated=bool(ended.violated),
+    )
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _positions(env: Environment, states: State) -> jax.Array:
+    """Where the agent is in its scene, ``[H, D]``; on a timeline that is what holds, bool ``[H, P]``."""
+    if isinstance(env, Drawable):
+        return jax.vmap(env.position)(states)
+    return jax.vmap(env.labels, (0, None))(states, env.default_params)
 
 
 def trajectory(episode: Episode, names: Sequence[str], file: Path) -> Path:
     """Draws an episode as a line, coloured by the sub-task in force; chosen instances are marked."""
     figure = Figure(figsize=(7.5, 5.2), layout="constrained")
     ax = figure.subplots()
-    episode.stage.draw(ax, episode.positions, episode.legs(names))
+    episode.scene.draw(ax, episode.positions, episode.legs(names))
     title = "\n".join(textwrap.wrap(episode.formula, 80))
     ax.set_title(f"{title}\n{episode.outcome}, {len(episode.assigned)} steps", fontsize=9)
-    ax.set_axis_off()
     figure.legend(loc="outside right center", title="sub-tasks", fontsize=9)
     figure.savefig(file, dpi=110, metadata={"Software": None})
     return file
@@ -186,10 +209,10 @@ def gallery(episodes: Sequence[Episode], names: Sequence[str], file: Path) -> Pa
     rows = -(-len(episodes) // columns)
     figure = Figure(figsize=(5 * columns, 5.2 * rows), layout="constrained")
     axes: Any = figure.subplots(rows, columns, squeeze=False)
-    for ax in axes.flat:
+    for ax in axes.flat[len(episodes) :]:
         ax.set_axis_off()
     for ax, episode in zip(axes.flat, episodes, strict=False):
-        episode.stage.draw(ax, episode.positions, episode.legs(names))
+        episode.scene.draw(ax, episode.positions, episode.legs(names))
         title = "\n".join(textwrap.wrap(episode.formula, 60))
         ax.set_title(f"{title}\n{episode.outcome}, {len(episode.assigned)} steps", fontsize=9)
         ax.legend(loc="upper right", fontsize=7)
@@ -215,7 +238,7 @@ def animation(episode: Episode, names: Sequence[str], file: Path) -> Path:
     frames = []
     for t in times:
         leg = next((leg for leg in legs if leg.first <= t <= leg.last), None)
-        picture = episode.stage.frame(episode.positions, t, leg)
+        picture = episode.scene.frame(episode.positions, t, leg)
         caption = f"step {t}: {leg.label if leg else episode.outcome}"
         frame = Image.new("RGB", (picture.shape[1], picture.shape[0] + 28), "white")
         frame.paste(Image.fromarray(picture), (0, 0))

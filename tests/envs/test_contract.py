@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import envs_jax
+from envs_jax.rooms.world import Rooms
 
 NUM = 8
 ONE_LAYOUT = {"walk"}
@@ -23,13 +24,18 @@ MAY_FAIL = {"flatworld", "zone", "zone-nm"}
 
 # Between solid walls MJX takes a minute to compile for each test.
 PRESETS = [
-    pytest.param(name, marks=[pytest.mark.slow] if name == "zone-ltl2action" else []) for name in envs_jax.registered()
+    pytest.param(name, marks=[pytest.mark.slow] if name == "zone-ltl2action" else [])
+    for name in (*envs_jax.registered(), "rooms")
 ]
 
 
 @pytest.fixture(scope="module", params=PRESETS)
 def env(request: pytest.FixtureRequest) -> envs_jax.Environment:
-    return envs_jax.make(request.param)
+    return _make(request.param)
+
+
+def _make(name: str) -> envs_jax.Environment:
+    return Rooms() if name == "rooms" else envs_jax.make(name)
 
 
 def _still(env: envs_jax.Environment) -> jax.Array:
@@ -79,8 +85,8 @@ def test_registry_refuses_what_it_does_not_know() -> None:
 
 
 def test_environments_are_static_values(env: envs_jax.Environment) -> None:
-    assert env == envs_jax.make(env.name)
-    assert hash(env) == hash(envs_jax.make(env.name))
+    assert env == _make(env.name)
+    assert hash(env) == hash(_make(env.name))
     assert len(set(env.propositions)) == env.num_propositions > 0
 
 

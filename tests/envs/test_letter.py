@@ -12,7 +12,6 @@ import pytest
 from scipy import stats
 
 import envs_jax
-from envs_jax.letter import render as letter_render
 from tests.probes import quick_jit
 
 
@@ -181,43 +180,6 @@ def test_transition_table_is_the_environment() -> None:
 def test_sizes_that_do_not_fit_are_refused(sizes: dict[str, int], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         envs_jax.make("letter", **sizes)
-
-
-def test_rgb() -> None:
-    layout = np.full((3, 3), -1)
-    layout[1, 2] = 4
-    image = letter_render.rgb(layout, (0, 1), trail=[(0, 0)], cell_pixels=20)
-    assert image.shape == (60, 60, 3)
-    assert image.dtype == np.uint8
-    cells = image.reshape(3, 20, 3, 20, 3).transpose(0, 2, 1, 3, 4)
-    assert (cells[1, 2] == letter_render.letter_color(4)).all(-1).mean() > 0.5
-    empty = cells[2, 2]
-    assert [tuple(cell) for cell in np.argwhere((cells != empty).any((2, 3, 4))).tolist()] == [(0, 0), (0, 1), (1, 2)]
-    # All letters look different, and have different colours.
-    drawn = [letter_render.rgb(np.array([[-1, i], [-1, -1]]), (0, 0)) for i in range(26)]
-    assert len({one.tobytes() for one in drawn}) == 26
-    assert len({letter_render.letter_color(i) for i in range(26)}) == 26
-
-
-def test_ansi() -> None:
-    layout = np.array([[-1, 0, -1], [-1, -1, 2], [1, -1, -1]])
-    assert letter_render.ansi(layout, (1, 2)) == " .  a  . \n .  . [c]\n b  .  . "
-    colored = letter_render.ansi(layout, (0, 0), color=True)
-    assert colored.count("\x1b[0m") == 3
-    assert colored.splitlines()[0].startswith("[.]")
-
-
-@pytest.mark.parametrize("draw", [letter_render.rgb, letter_render.ansi])
-def test_drawing_refuses_nonsense(draw) -> None:
-    with pytest.raises(ValueError, match=r"shape \(3, 2\)"):
-        draw(np.zeros((3, 2), int), (0, 0))
-    with pytest.raises(ValueError, match=r"at \[3, 0\]"):
-        draw(np.zeros((3, 3), int), (3, 0))
-
-
-def test_cells_too_small_to_draw() -> None:
-    with pytest.raises(ValueError, match="cell_pixels is 5"):
-        letter_render.rgb(np.zeros((3, 3), int), (0, 0), cell_pixels=5)
 
 
 def test_a_turned_world_is_the_same_world() -> None:

@@ -12,7 +12,6 @@ import pytest
 
 import envs_jax
 from envs_jax import Walk, WalkLayout, load_layouts, save_layouts
-from envs_jax.walk import render as walk_render
 from envs_jax.walk.world import FLATWORLD_DISCS, NO_DISC, PAPER_DISCS
 
 
@@ -290,97 +289,3 @@ def test_the_grid_is_where_steps_lead(name: str) -> None:
     assert compared > 100
     # The last place along a side is the last that a step leads to.
     assert np.ptp(inside.any(1).nonzero()[0]) + 1 == inside.any(1).sum() >= (env.high - env.low) / env.step_size - 1
-
-
-def test_regions_of_the_picture_and_the_agent() -> None:
-    env = envs_jax.make("walk")
-    scene = walk_render.walk_scene(env, _layout(env))
-    size = 220  # twenty pixels for each unit
-    image = walk_render.rgb(scene, (2.0, 5.0), trail=[(3.0, 7.0)], size=size)
-    assert image.shape == (size, size, 3)
-    assert image.dtype == np.uint8
-
-    def at(x: float, y: float) -> list[int]:
-        return image[int((10 - y) * 20), int((x + 1) * 20)].tolist()
-
-    background = at(3.0, -0.5)
-    assert at(2.0, 5.0) != background  # the agent
-    assert at(3.0, 7.0) == at(2.0, 5.0)  # the trail
-    # Beside the middle, where the letter stands.
-    colours = {region.name: at(region.x + 0.7, region.y) for region in scene.regions}
-    assert len({tuple(colour) for colour in colours.values()}) == 5
-    assert background not in colours.values()
-    assert at(5.1, 4.5) == background == at(7.0, 4.0)
-    plain = walk_render.rgb(scene, (2.0, 5.0), size=size)
-    differs = (plain != image).any(-1)
-    assert 0 < differs.sum() < 40
-    assert all(abs(row - 60) <= 4 and abs(column - 80) <= 4 for row, column in np.argwhere(differs))
-
-
-def test_chosen_and_avoided_regions_and_headings_show() -> None:
-    env = envs_jax.make("flatworld")
-    scene = walk_render.walk_scene(env, _layout(env))
-    assert len(scene.regions) == 9
-    assert {region.name for region in scene.regions} == set(env.propositions)
-    plain = walk_render.rgb(scene, (1.9, 1.9))
-    chosen = scene.index_at((0.5, -1.3), ("red", "blue"))
-    assert [scene.regions[i].name for i in chosen] == ["red"]
-    assert scene.regions[chosen[0]].y < 0  # the lower one of two
-    assert scene.index_at((0.5, -1.3), ("blue",)) == ()
-
-    def rows_and_columns(**options: Any) -> tuple[np.ndarray, np.ndarray]:
-        changed = np.argwhere((walk_render.rgb(scene, (1.9, 1.9), **options) != plain).any(-1))
-        return -2 + changed[:, 1] / 84, 2 - changed[:, 0] / 84
-
-    x, y = rows_and_columns(chosen=chosen)
-    assert len(x) > 50
-    assert (np.abs(np.hypot(x - 0.5, y + 1.3) - 0.35) < 0.06).all()
-    x, y = rows_and_columns(avoided=("yellow",))
-    assert len(x) > 50
-    assert (np.hypot(x + 1.0, y + 1.2) < 0.32).all()
-    x, y = rows_and_columns(heading=np.pi)
-    assert len(x) > 5
-    assert x.max() < 1.9
-
-
-def test_drawing_refuses_nonsense() -> None:
-    env = envs_jax.make("walk")
-    scene = walk_render.walk_scene(env, _layout(env))
-    with pytest.raises(ValueError, match="size is 20"):
-        walk_render.rgb(scene, (0, 0), size=20)
-    with pytest.raises(ValueError, match="position is"):
-        walk_render.rgb(scene, (0,))
-    with pytest.raises(ValueError, match="position is"):
-        walk_render.rgb(scene, (0, np.nan))
-
-
-def test_episodes_on_axes() -> None:
-    figure_module = pytest.importorskip("matplotlib.figure")
-    agg = pytest.importorskip("matplotlib.backends.backend_agg")
-    env = envs_jax.make("walk")
-    scene = walk_render.walk_scene(env, _layout(env))
-    figure = figure_module.Figure(figsize=(4, 4))
-    ax = figure.subplots()
-    positions = np.stack([np.linspace(0, 5.1, 30), np.linspace(0, 3.1, 30)], 1)
-    walk_render.draw_episode(
-        ax,
-        scene,
-        positions,
-        legs=[0] * 20 + [1] * 9,
-        names=("first", "second"),
-        reached={29: ("a",)},
-        avoided=("c",),
-    )
-    walk_render.draw_path(ax, positions[:, ::-1], color="#00ff00")
-    _, labels = ax.get_legend_handles_labels()
-    assert labels == ["first", "second"]
-    circles = [patch for patch in ax.patches if hasattr(patch, "radius")]
-    assert [circle.get_linewidth() > 1 for circle in circles] == [True, False, False, False, False]
-    assert [bool(circle.get_hatch()) for circle in circles] == [False, False, True, False, False]
-    canvas = agg.FigureCanvasAgg(figure)
-    canvas.draw()
-    pixels = np.asarray(canvas.buffer_rgba())[..., :3].astype(int)
-    green = (pixels[..., 1] > 200) & (pixels[..., 0] < 80) & (pixels[..., 2] < 80)
-    assert green.sum() > 50
-    with pytest.raises(ValueError, match="legs for"):
-        walk_render.draw_path(ax, positions, legs=[0, 1])

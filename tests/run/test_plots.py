@@ -10,27 +10,39 @@ import jax
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from PIL import Image
 
 import envs_jax
+from envs_jax.scenes import GridScene, Leg
+from hrlspec.agent.agent import Agent
+from hrlspec.config import Config, NetworkConfig
+from hrlspec.evaluation import suite_from_text
+from hrlspec.methods import METHODS
 from hrlspec.run import plots
 from hrlspec.run.plots import Episode
-from hrlspec.run.stages import LetterStage, stage_of
+from hrlspec.run.timeline import Timeline
+from hrlspec.tasks.rewards import reward_machine
+from tests.bare import Bare
+from tests.probes import Corridor, random_params
 from tests.trees import tree_of
 
 NAMES = tuple("abcde")
+SMALL = Config(
+    network=NetworkConfig(latent=8, conv_channels=(), encoder_mlp=(8,), actor=(8,), critic=(8,), task_rounds=0)
+)
 
 
 @pytest.fixture
 def episode() -> Episode:
     """Down over the edge of the torus onto a, then right to b; c is the other branch."""
-    layout = np.full((5, 5), -1)
-    layout[3, 0], layout[3, 2], layout[1, 1] = 0, 1, 2
+    rows = ("", "", "", "", ""), ("", "c", "", "", ""), ("a", "", "b", "", "")
+    scene = GridScene((rows[0], rows[1], rows[0], rows[2], rows[0]))
     cells = np.array([[0, 0], [4, 0], [3, 0], [3, 1], [3, 2]])
     return Episode(
         formula="(achieve a; achieve b) or achieve c",
         tree=tree_of([(0, "a", ""), (0, "c", ""), (1, "b", "d")]),
-        stage=LetterStage(layout),
+        scene=scene,
         positions=cells,
         nodes=np.array([0, 0, 1, 1, 3]),
         assigned=np.array([1, 1, 3, 3]),
@@ -89,7 +101,7 @@ def test_an_animation_has_a_frame_for_each_state(episode: Episode, tmp_path: Pat
         for i in range(image.n_frames):
             image.seek(i)
             frames.append(np.asarray(image.convert("RGB"), int))
-    size = 5 * LetterStage(np.zeros((5, 5))).cell
+    size = 5 * 48
     assert all(frame.shape == (size + 28, size, 3) for frame in frames)
     assert all((first != second).any() for first, second in itertools.pairwise(frames))
 
@@ -105,17 +117,16 @@ def test_learning_curves_of_several_runs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["walk", "flatworld", "zone"])
 def test_worlds_of_discs_are_drawn_from_above(name: str, tmp_path: Path) -> None:
-    """A long straight way: fewer frames than steps, every sub-task named, goals where regions are."""
+    """A long straight line: fewer frames than steps, every sub-task named, goals where regions are."""
     env = envs_jax.make(name)
     layout = jax.tree.map(np.asarray, env.sample_layout(jax.random.key(0), env.default_params))
-    stage = stage_of(env, layout)
-    assert stage is not None
-    way = np.linspace([0, 0, 0], [1.5, 1, 1], 301)[:, : 3 if name == "zone" else 2]
+    assert isinstance(env, envs_jax.Drawable)
+    line = np.linspace([0, 0, 0], [1.5, 1, 1], 301)[:, : 3 if name == "zone" else 2]
     episode = Episode(
         formula="one; other",
         tree=tree_of([(0, "a", ""), (1, "b", "c")], num_propositions=env.num_propositions),
-        stage=stage,
-        positions=way,
+        scene=env.scene(layout),
+        positions=line,
         nodes=np.repeat([0, 1, 2], [150, 150, 1]),
         assigned=np.repeat([1, 2], 150),
         success=True,
@@ -127,3 +138,73 @@ def test_worlds_of_discs_are_drawn_from_above(name: str, tmp_path: Path) -> None
         assert len(np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0)) > 20
     with Image.open(plots.animation(episode, names, tmp_path / "e.gif")) as image:
         assert 50 < image.n_frames <= 81
+
+
+# --- Environments that do not say what they look like. ---
+
+NOWHERE, A, B = (0, 0, 0), (1, 0, 0), (0, 1, 0)
+HELD = np.array([NOWHERE, NOWHERE, A, NOWHERE, B], bool)
+LEGS = [Leg(0, 1, "1. a, avoiding c", ("a",), ("c",), True), Leg(2, 3, "2. b", ("b",), (), True)]
+
+
+def test_a_timeline_shows_what_held_what_was_asked_and_when_it_moved_on() -> None:
+    ax = Figure().subplots()
+    Timeline(("a", "b", "c")).draw(ax, HELD, LEGS)
+    bars = [(round(bar.get_y() + bar.get_height() / 2), bar.get_x(), bar.get_width()) for bar in ax.patches]
+    assert bars[:2] == [(0, 1.5, 1.0), (1, 3.5, 1.0)]  # a held before step 2, b after the last
+    assert (0, 0, 2) in bars  # a was to be reached in steps 0 and 1
+    assert (2, 0, 2) in bars  # and c to be avoided
+    assert (1, 2, 2) in bars
+    assert [(x, row, width) for row, x, width in bars if row == 3] == [(0, 3, 2), (2, 3, 2)]  # sub-tasks
+    assert [line.get_xdata()[0] for line in ax.lines] == [2, 4]
+    assert ax.get_legend_handles_labels()[1] == [leg.label for leg in LEGS]
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["a", "b", "c", "sub-task"]
+
+
+def test_a_frame_of_a_timeline_shows_no_more_than_has_happened() -> None:
+    line = Timeline(("a", "b", "c"))
+    frames = [line.frame(HELD, now, LEGS[min(now // 2, 1)] if now < 4 else None) for now in range(5)]
+    assert len({frame.shape for frame in frames}) == 1
+    dark = [(frame[:, 120:] < 60).all(-1).reshape(3, 22, -1).any((1, 2)).tolist() for frame in frames]
+    assert dark == [[False] * 3] * 2 + [[True, False, False]] * 2 + [[True, True, False]]
+    background = [frame[3, -3].tolist() for frame in frames]
+    assert background[0] == background[1] != background[2] == background[4]  # a is asked for in the first leg alone
+
+
+def test_any_environment_is_drawn(tmp_path: Path) -> None:
+    """With nothing but the contract: what an untrained agent does, as picture and animation."""
+    env = Corridor(horizon=6)
+    assert not isinstance(env, envs_jax.Drawable)
+    agent = Agent(env, SMALL, METHODS["ltl2action"])
+    suite = suite_from_text("two", "achieve a\nachieve b; achieve c", env.propositions)
+    params = random_params(agent, 0)
+    machine = reward_machine(env.propositions)
+    shown = plots.episodes_of(jax.random.key(0), agent, params, machine, suite)
+    for episode in shown:
+        assert episode.scene == Timeline(env.propositions)
+        assert episode.positions.shape == (len(episode.assigned) + 1, 4) or len(episode.assigned) == env.horizon - 1
+        assert episode.positions.dtype == bool
+    files = plots.examples(jax.random.key(0), agent, params, machine, suite, tmp_path)
+    assert sorted(file.name for file in files) == sorted(
+        [*(f"{kind}_{depth}.png" for kind in ("example", "task") for depth in (1, 2)), "episode.gif"]
+    )
+    for file in files:
+        with Image.open(file) as image:
+            assert min(image.size) > 80
+
+
+def test_positions_are_those_of_the_labels(tmp_path: Path) -> None:
+    """A letter holds on the timeline just when the same episode's place in the scene bears it."""
+    letter = envs_jax.make("letter", horizon=20)
+    suite = suite_from_text("one", "achieve a; achieve b", letter.propositions)
+    machine = reward_machine(letter.propositions)
+    key = jax.random.key(1)
+    (seen,), (bare,) = (
+        plots.episodes_of(key, agent, random_params(agent, 1), machine, suite)
+        for agent in (Agent(env, SMALL, METHODS["ltl2action"]) for env in (letter, Bare(letter)))
+    )
+    scene = seen.scene
+    assert isinstance(scene, GridScene)
+    names = [scene.cells[row][column] for row, column in seen.positions]
+    assert names == ["".join(np.array(list(letter.propositions))[held]) for held in bare.positions]
+    assert any(names)

@@ -1,4 +1,4 @@
-"""The two worlds of the paper's motivating examples, small enough to be learned in a minute.
+"""Rooms: three in a row, a locked door, and a key that no task speaks of; the paper's motivating example.
 
 Axes: **H** rows, **W** columns.
 """
@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs_jax import Box, Discrete, Environment, EnvParams, Walk
-from envs_jax.base import StepResult
+from envs_jax.base import Box, Discrete, Drawable, EnvParams, StepResult
+from envs_jax.scenes import GridScene
 
 ROOM = 3
 """Cells along each side of a room."""
@@ -46,7 +46,7 @@ class RoomsState:
 
 
 @dataclasses.dataclass(frozen=True)
-class Rooms(Environment):
+class Rooms(Drawable):
     """Three rooms in a row; the door to the last is locked, and the key, which no task speaks of, lies in the first.
 
     Observation: float32 ``[4, H, W]``: red ball, blue ball, agent, key (gone when it was taken). Actions: 0 up, 1 down,
@@ -127,6 +127,20 @@ class Rooms(Environment):
         """The balls belong to propositions, agent and key to none."""
         return observation[:2], observation[2:].reshape(-1)
 
+    def scene(self, layout: RoomsLayout) -> GridScene:
+        """Balls and key, walls, and the locked door, which is one of the cells."""
+        cells = [[""] * COLUMNS for _ in range(ROWS)]
+        cells[MIDDLE][DOORS[1]] = "door"
+        for name in ("key", *self.propositions):
+            row, column = np.asarray(getattr(layout, name)).tolist()
+            cells[row][column] = name
+        walls = tuple((row, column) for row in range(ROWS) for column in DOORS if row != MIDDLE)
+        return GridScene(tuple(map(tuple, cells)), walls)
+
+    def position(self, state: RoomsState) -> jax.Array:
+        """Row and column, int32 ``[2]``."""
+        return state.position
+
 
 def _image(cell: jax.Array) -> jax.Array:
     return (np.arange(ROWS)[:, None] == cell[0]) & (np.arange(COLUMNS) == cell[1])
@@ -146,15 +160,3 @@ def _distance(here: np.ndarray, there: np.ndarray) -> int:
     else:
         rows = abs(here[0] - there[0])
     return int(rows + abs(here[1] - there[1]))
-
-
-DILEMMA = Walk(
-    discs=(("a", 2.2, 1.0, 0.7), ("b", 4.6, 2.2, 0.7), ("c", 7.6, 2.4, 0.7), ("d", 6.2, 0.9, 0.7)),
-    low=-1.0,
-    high=9.0,
-    step_size=0.2,
-    horizon=200,
-    name="dilemma",
-)
-"""The way to b leads past a, and reaching a ends the task before c, which pays most, can be reached."""
-DILEMMA_TASK = "achieve a ensuring not d or achieve b ensuring not d; (achieve c ensuring not d)"
