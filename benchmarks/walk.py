@@ -30,6 +30,7 @@ class Flags(common.CommonFlags):
 def planner(name: str, num_tasks: int = 20) -> dict[str, float]:
     """Seconds to solve a random task of depth 2 to 4 in one layout: least steps and the nearest-first agent's."""
     env = envs_jax.make(name)
+    assert isinstance(env, envs_jax.GridMap)
     layouts = jax.tree.map(lambda x: np.asarray(x)[None], env.sample_layout(jax.random.key(0), env.default_params))
     trees = sample_trees(
         np.random.default_rng(0),
