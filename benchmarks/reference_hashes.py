@@ -93,7 +93,7 @@ def _trained(some: Preset, recipe: Recipe, method: str, reward_set: RewardSet) -
         with_planner = Trainer(Agent(env, config, dataclasses.replace(chosen, high=planner)))
         drawn = with_planner.init(jax.random.key(0), bank(0), machine).params["reach_critic"]
         state = dataclasses.replace(state, params=state.params | {"reach_critic": drawn})
-    iterate = Trainer.iterate.lower(trainer, state, bank(0), machine, jnp.asarray(reserved)).compile()  # type: ignore[attr-defined]
+    iterate = Trainer.iterate.lower(trainer, state, bank(0), machine, jnp.asarray(reserved)).compile()
     for i in range(ITERATIONS):
         state, _ = iterate(state, bank(i // ITERATIONS_PER_BANK), machine, jnp.asarray(reserved))
     return state.params

@@ -1,4 +1,4 @@
-"""The specification language SPECTRL: text, syntax tree, padded task tree, monitor and samplers."""
+"""The specification language SPECTRL: text, syntax tree, padded task tree and monitor."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ from hrlspec.spec.syntax import (
 )
 from hrlspec.spec.text import to_text, tree_to_formula, tree_to_text
 from hrlspec.spec.tree import TaskTree, subtask_avoid
-from hrlspec.tasks.sampling import sample_sequences, sample_trees
 
 __all__ = [
     "RUNNING",
@@ -52,8 +51,6 @@ __all__ = [
     "initial",
     "open_edges",
     "parse",
-    "sample_sequences",
-    "sample_trees",
     "satisfies",
     "subtask_avoid",
     "subtasks",
