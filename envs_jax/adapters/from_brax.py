@@ -72,6 +72,11 @@ def from_brax(
                 f"{where}: it resets itself (AutoResetWrapper), so that the last state of an episode is never seen; "
                 "give the environment within"
             )
+        if jnp.ndim(state.done):
+            raise ValueError(
+                f"{where}: done has shape {list(state.done.shape)}, expected []; give the environment within, without "
+                "wrappers that batch it"
+            )
         return state.obs, state
 
     def step(key: jax.Array, state: Any, action: jax.Array, params: Any) -> tuple[Any, ...]:
