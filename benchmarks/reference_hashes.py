@@ -28,19 +28,19 @@ FLAGS = " ".join(
 )
 os.environ.update(XLA_FLAGS=FLAGS, JAX_PLATFORMS="cpu", JAX_ENABLE_COMPILATION_CACHE="false")
 
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-import tyro  # noqa: E402
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
 
-from hrlspec.agent.agent import Agent  # noqa: E402
-from hrlspec.checkpoint.leaves import flatten  # noqa: E402
-from hrlspec.config import evolve  # noqa: E402
-from hrlspec.learning.train import Trainer  # noqa: E402
-from hrlspec.methods import METHODS, ImplicitPlanner  # noqa: E402
-from hrlspec.presets import RECIPES, Preset, Recipe, RewardSet, preset  # noqa: E402
-from hrlspec.presets.suites import reserved_hashes  # noqa: E402
-from hrlspec.tasks.curriculum import draw_bank  # noqa: E402
+from hrlspec.agent.agent import Agent
+from hrlspec.checkpoint.leaves import flatten
+from hrlspec.config import evolve
+from hrlspec.learning.train import Trainer
+from hrlspec.methods import METHODS, ImplicitPlanner
+from hrlspec.presets import RECIPES, Preset, Recipe, RewardSet, preset
+from hrlspec.presets.suites import reserved_hashes
+from hrlspec.tasks.curriculum import draw_bank
 
 RECORD = Path(__file__).with_suffix(".json")
 ITERATIONS = 30
