@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from experiments.paper.panels import Curve
+from experiments.paper.records import Record
 from hrlspec.evaluation.stats import Interval, probability_of_improvement, stratified_bootstrap
-from hrlspec.run.experiment import Method, Recipe
+from hrlspec.presets import Recipe
 
-Record = Mapping[str, Any]
 Records = Mapping[Curve, Sequence[Record]]
 FEWEST_SEEDS = 5
 """Below this there is no verdict."""
@@ -20,24 +19,24 @@ FEWEST_SEEDS = 5
 
 def final_return(record: Record) -> float:
     """Mean return on unseen tasks at the end."""
-    return float(record["final"]["suite"]["return_mean"])
+    return float(record.final["suite"]["return_mean"])
 
 
 def mean_return(record: Record) -> float:
     """Mean of the learning curve: the area under it over its width. Who learns faster has more."""
-    return float(np.mean([row["eval/return_mean"] for row in record["rows"]]))
+    return float(np.mean(record.curve["eval/return_mean"]))
 
 
 def no_violations(record: Record) -> float:
     """Minus the share of steps while collecting that violated a task."""
-    return -float(np.mean([row["train/violations"] for row in record["rows"]]))
+    return -float(np.mean(record.curve["train/violations"]))
 
 
 def steps_to_most(record: Record, share: float = 0.9) -> float:
     """Environment steps after which the curve has reached a share of its last value for the first time."""
-    rows = record["rows"]
-    goal = share * rows[-1]["eval/return_mean"]
-    return float(next(row["env_steps"] for row in rows if row["eval/return_mean"] >= goal))
+    returns = record.curve["eval/return_mean"]
+    first = next(i for i, value in enumerate(returns) if value >= share * returns[-1])
+    return float(record.curve["env_steps"][first])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,12 +53,12 @@ class Claim:
 
     text: str
     panels: tuple[str, ...]
-    better: tuple[Method, tuple[str, ...]]
-    worse: tuple[Method, tuple[str, ...]]
+    better: tuple[str, tuple[str, ...]]
+    worse: tuple[str, tuple[str, ...]]
     score: Callable[[Record], float]
 
 
-_OURS: tuple[Method, tuple[str, ...]] = ("ours", ())
+_OURS: tuple[str, tuple[str, ...]] = ("ours", ())
 _FIRST = ("letter-set1", "walk-set1", "zone-set1")
 _SECOND = ("letter-set2", "walk-set2", "zone-set2")
 _ABLATIONS = ("letter-ablation", "walk-ablation", "zone-ablation")

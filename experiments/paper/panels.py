@@ -1,19 +1,10 @@
-"""What the paper's figures are made of: panels, their curves, and the record that each run leaves behind.
-
-A record is a run's settings, learning curve and final scores, small enough to be kept; figures and claims are drawn
-from them.
-"""
+"""The panels of the paper's figures, their curves, and the runs behind each curve."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
-from pathlib import Path
-from typing import Any
 
-from hrlspec.run.errors import UserError
-from hrlspec.run.experiment import RECIPES, Method, Recipe, RewardSet
-from hrlspec.run.folder import read_metrics, read_record, read_summary
+from hrlspec.presets import RECIPES, Recipe, RewardSet
 
 ENVIRONMENTS = ("letter", "walk", "zone")
 BUDGETS = {"letter": 1_500_000, "walk": 2_000_000, "zone": 4_000_000}
@@ -21,7 +12,7 @@ BUDGETS = {"letter": 1_500_000, "walk": 2_000_000, "zone": 4_000_000}
 NUM_SEEDS = 5
 POINTS = 20
 """Evaluations along a curve."""
-_ROW = ("env_steps", "wall_s", "level", "eval/return_mean", "eval/success_rate", "eval/steps_mean", "train/violations")
+_OPTIMISER = "config.low.optimiser."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,17 +22,18 @@ class Curve:
     Attributes:
         method: who is trained.
         recipe: with which settings.
-        switches: further flags of ``experiments.run``: ``--no-`` and a technique, or ``--config.low.FIELD=VALUE``.
+        switches: further flags of ``experiments.run``: ``--no-`` and a technique, or a setting of the low level's
+            optimiser.
     """
 
-    method: Method
+    method: str
     recipe: Recipe
     switches: tuple[str, ...] = ()
 
     @property
     def label(self) -> str:
         """Such as ``ours (paper)``, ``ours without shield (paper)``, ``ours learning rate 0.001 (paper)``."""
-        words = (switch.replace("--no-", "without ").removeprefix("--config.low.") for switch in self.switches)
+        words = (switch.replace("--no-", "without ").removeprefix(f"--{_OPTIMISER}") for switch in self.switches)
         parts = [self.method, *(word.replace("-", " ").replace("=", " ") for word in words)]
         return f"{' '.join(parts)} ({self.recipe})"
 
@@ -59,7 +51,7 @@ class Run:
     @property
     def name(self) -> str:
         """Of its folder and record."""
-        flags = (switch.removeprefix("--").removeprefix("config.low.") for switch in self.curve.switches)
+        flags = (switch.removeprefix("--").removeprefix(_OPTIMISER) for switch in self.curve.switches)
         switches = "".join(f"-{flag.replace('=', '-')}" for flag in flags)
         return f"{self.env}-{self.curve.method}-{self.curve.recipe}-set{self.reward_set}{switches}-seed{self.seed}"
 
@@ -106,11 +98,11 @@ class Panel:
         return [Run(self.env, self.reward_set, curve, seed, steps) for seed in seeds for curve in self.curves]
 
 
-_COMPARED: tuple[Method, ...] = ("ours", "ltl2action", "option")
-_ABLATED: tuple[Method, ...] = ("ours", "myopic-low", "no-er")
+_COMPARED: tuple[str, ...] = ("ours", "ltl2action", "option")
+_ABLATED: tuple[str, ...] = ("ours", "myopic-low", "no-er")
 
 
-def _curves(methods: tuple[Method, ...]) -> tuple[Curve, ...]:
+def _curves(methods: tuple[str, ...]) -> tuple[Curve, ...]:
     return tuple(Curve(method, recipe) for recipe in RECIPES for method in methods)
 
 
@@ -157,7 +149,7 @@ TRIED = {
 
 def _trials(env: str) -> tuple[Curve, ...]:
     return tuple(
-        Curve(method, recipe, (f"--config.low.learning-rate={rate:g}",))
+        Curve(method, recipe, (f"--{_OPTIMISER}learning-rate={rate:g}",))
         for recipe in RECIPES
         for method in _COMPARED
         for rate in TRIED[env, recipe]
@@ -185,60 +177,3 @@ TRAJECTORY_TASKS = (
 def trajectory_run(total_steps: int | None) -> Run:
     """Whose checkpoint is drawn."""
     return Run("walk", 1, Curve("ours", "hrlspec"), 0, total_steps or BUDGETS["walk"])
-
-
-def record_of(folder: Path) -> dict[str, Any] | None:
-    """What is kept of a run folder, ``None`` while the run is not finished.
-
-    Raises:
-        UserError: the folder is damaged.
-    """
-    summary = read_summary(folder) if folder.exists() else None
-    if summary is None:
-        return None
-    made = read_record(folder)
-    suite = dict(summary["final"]["suite"])
-    suite.pop("per_task", None)
-    return {
-        "name": summary["name"],
-        "config": made["config"],
-        "env_steps": summary["env_steps"],
-        "wall_s": summary["wall_s"],
-        "versions": made["versions"],
-        "commit": made["commit"],
-        "machine": made["machine"],
-        "rows": [{name: row.get(name) for name in _ROW} for row in read_metrics(folder)],
-        "final": {**summary["final"], "suite": suite},
-    }
-
-
-def read_run(run: Run, records: Path) -> dict[str, Any] | None:
-    """The record of a run, ``None`` if there is none, or one of another number of steps.
-
-    Raises:
-        UserError: it cannot be read.
-    """
-    file = record_file(run, records)
-    try:
-        record: dict[str, Any] = json.loads(file.read_text())
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError) as error:
-        raise UserError(f"cannot read {file}: {error}; without it the run is made again") from error
-    return record if record.get("asked_steps") == run.total_steps else None
-
-
-def write_run(run: Run, record: dict[str, Any], records: Path) -> Path:
-    """Keeps a record, and with it the flags that make the run again."""
-    file = record_file(run, records)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    whole = {"flags": " ".join(run.flags), "asked_steps": run.total_steps, **record}
-    scratch = file.with_suffix(".new")
-    scratch.write_text(json.dumps(whole, indent=1) + "\n")
-    scratch.replace(file)
-    return file
-
-
-def record_file(run: Run, records: Path) -> Path:
-    """Where a run's record is kept."""
-    return records / run.env / f"{run.name}.json"

@@ -8,13 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.paper.claims import (
     CLAIMS,
-    Record,
     Records,
     final_return,
     finding,
@@ -23,8 +21,9 @@ from experiments.paper.claims import (
     steps_to_most,
 )
 from experiments.paper.panels import PANELS, TRAJECTORIES, TUNING, Curve, Panel, Run
+from experiments.paper.records import Record
 from hrlspec.evaluation.stats import interquartile_mean, mean_interval
-from hrlspec.run.experiment import RECIPES
+from hrlspec.presets import RECIPES
 from hrlspec.run.progress import duration
 
 _ABOUT = """\
@@ -53,7 +52,7 @@ def write_report(panels: Sequence[Panel], records: Mapping[Run, Record], figures
     Args:
         panels: what to draw.
         records: of the runs that are finished.
-        figures: folder for PNG and SVG.
+        figures: folder for the PNG files.
         report: the page (Markdown).
     """
     by_panel, tuning = (
@@ -62,7 +61,7 @@ def write_report(panels: Sequence[Panel], records: Mapping[Run, Record], figures
     figures.mkdir(parents=True, exist_ok=True)
     for panel, found in by_panel.items():
         if panel in panels:
-            yield from _draw(panel, found, figures / panel.name)
+            yield _draw(panel, found, figures / f"{panel.name}.png")
     report.parent.mkdir(parents=True, exist_ok=True)
     page = _page(by_panel, Path(os.path.relpath(figures, report.parent)), report)
     report.write_text("\n".join([*page, *_times(by_panel), *_tuning(tuning)]) + "\n")
@@ -77,8 +76,8 @@ def _of_panel(panel: Panel, records: Mapping[Run, Record]) -> dict[Curve, list[R
     return {curve: found[curve] for curve in panel.curves if curve in found}
 
 
-def _draw(panel: Panel, records: Records, file: Path) -> Iterator[Path]:
-    """One axis for each recipe that has curves; PNG and SVG."""
+def _draw(panel: Panel, records: Records, file: Path) -> Path:
+    """One axis for each recipe that has curves."""
     recipes = [recipe for recipe in RECIPES if any(curve.recipe == recipe for curve in records)]
     figure = Figure(figsize=(0.5 + 4.5 * len(recipes), 3.6), layout="constrained")
     axes: Any = figure.subplots(1, len(recipes), squeeze=False, sharey=True)
@@ -92,19 +91,16 @@ def _draw(panel: Panel, records: Records, file: Path) -> Iterator[Path]:
         ax.grid(alpha=0.3)
         ax.legend(fontsize=8)
     axes[0, 0].set_ylabel("average return on unseen tasks", fontsize=9)
-    for suffix in (".png", ".svg"):
-        # Without dates and random names the same records give the same file.
-        metadata = {"Software": None} if suffix == ".png" else {"Date": None}
-        with rc_context({"svg.hashsalt": panel.name}):
-            figure.savefig(file.with_suffix(suffix), dpi=110, metadata=metadata)
-        yield file.with_suffix(suffix)
+    # Without the drawing library's version the same records give the same file.
+    figure.savefig(file, dpi=110, metadata={"Software": None})
+    return file
 
 
 def _band(ax: Axes, colour: str, label: str, records: Sequence[Record]) -> None:
     """Mean over seeds, and its 95 % interval by Student's t."""
-    length = min(len(record["rows"]) for record in records)
-    steps = np.array([row["env_steps"] for row in records[0]["rows"][:length]]) / 1e6
-    returns = np.array([[row["eval/return_mean"] for row in record["rows"][:length]] for record in records])
+    length = min(len(record.curve["env_steps"]) for record in records)
+    steps = np.array(records[0].curve["env_steps"][:length]) / 1e6
+    returns = np.array([record.curve["eval/return_mean"][:length] for record in records])
     intervals = [mean_interval(column) for column in returns.T]
     ax.plot(steps, [interval.estimate for interval in intervals], color=colour, label=f"{label} ({len(records)})")
     if len(records) >= _FEWEST_FOR_BAND:
@@ -166,7 +162,7 @@ def _times(by_panel: Mapping[Panel, Records]) -> Iterator[str]:
         for recipe in RECIPES:
             curves = [curve for curve in records if curve.recipe == recipe]
             new = [curve for curve in curves if (panel.env, panel.reward_set, curve) not in counted]
-            runs = [record["wall_s"] for curve in new for record in records[curve]]
+            runs = [record.wall_s for curve in new for record in records[curve]]
             cells.append(f"{len(runs)} runs, {duration(sum(runs))}" if runs else "")
             counted |= {(panel.env, panel.reward_set, curve) for curve in new}
         yield f"| {panel.name} | {' | '.join(cells)} |"
@@ -196,12 +192,12 @@ def _rows(records: Records) -> Iterator[str]:
     for curve, some in records.items():
         steps = over_seeds(steps_to_most, some).estimate
         ratio = f"{fastest[curve.recipe] / steps:.2f}" if curve.recipe in fastest else ""
-        suites = [record["final"]["suite"] for record in some]
-        contested = [record["final"].get("contested_choice") or {} for record in some]
-        optimum = [record["final"].get("return_over_optimum") or {} for record in some]
+        suites = [record.final["suite"] for record in some]
+        contested = [record.final.get("contested_choice") or {} for record in some]
+        optimum = [record.final.get("return_over_optimum") or {} for record in some]
         scores = [_mean(suites, "success_rate"), _mean(suites, "steps_mean", ".0f"), _mean(suites, "spl")]
         scores += [_mean(contested, "contested_choice"), _mean(optimum, "return_over_optimum")]
-        wall = duration(float(np.mean([record["wall_s"] for record in some])))
+        wall = duration(float(np.mean([record.wall_s for record in some])))
         final = " | ".join([str(over_seeds(final_return, some)), *scores])
         learning = f"{over_seeds(mean_return, some)} | {steps:,.0f} | {ratio} | {wall}"
         yield f"| {curve.label} | {len(some)} | {final} | {learning} |"

@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 import os
-import signal
 import subprocess
 import sys
-import threading
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import numpy as np
 import pytest
 
 import envs_jax
 from experiments import reproduce
+from experiments.paper import making
 from experiments.paper.claims import (
     CLAIMS,
     Claim,
-    Record,
     final_return,
     finding,
     mean_return,
@@ -37,30 +34,21 @@ from experiments.paper.panels import (
     Curve,
     Panel,
     Run,
-    read_run,
-    record_file,
     trajectory_run,
-    write_run,
 )
+from experiments.paper.records import CURVE, Record, add_record, read_records, record_of
 from experiments.paper.report import write_report
-from hrlspec import compile, parse
-from hrlspec.config import PPOConfig, ShieldConfig
-from hrlspec.presets.settings import preset
+from hrlspec import compile_task, parse
+from hrlspec.methods import ImplicitPlanner
+from hrlspec.presets import Recipe, preset
 from hrlspec.run.errors import Interrupted, UserError
-from hrlspec.run.experiment import Experiment, Method, Recipe, experiment_of, experiments_of, parse_run
-from tests.run.tiny import arguments
+from hrlspec.run.experiment import Experiment
+from hrlspec.run.run_flags import experiments_of, parse_run
+from tests.experiments.earlier_settings import effective
+from tests.experiments.made import record
+from tests.run.tiny import TOTAL, arguments
 
 KEPT = Path(__file__).parents[2] / "results" / "paper"
-
-
-def record(curve: list[float], final: float, violations: float = 0.0) -> dict[str, Any]:
-    """A record of evaluations every 100 steps."""
-    rows = [
-        {"env_steps": 100 * (i + 1), "eval/return_mean": value, "train/violations": violations}
-        for i, value in enumerate(curve)
-    ]
-    suite = {"return_mean": final, "success_rate": final, "spl": final, "steps_mean": 50.0}
-    return {"wall_s": 60.0, "rows": rows, "final": {"suite": suite, "contested_choice": {"contested_choice": final}}}
 
 
 @functools.cache
@@ -94,9 +82,10 @@ def test_every_run_is_one_that_can_be_made_and_has_a_name_of_its_own() -> None:
         assert (experiment.env, experiment.method, experiment.recipe) == (run.env, run.curve.method, run.curve.recipe)
         assert (experiment.reward_set, experiment.config.total_steps) == (run.reward_set, run.total_steps)
     (plain, no_max, no_shield) = PANELS["letter-techniques"].runs(1, None)
-    configs = [experiment_now(run).config for run in (plain, no_max, no_shield)]
-    assert [config.max_operator for config in configs] == [True, False, True]
-    assert [config.shield.mode != "off" for config in configs] == [True, True, False]
+    experiments = [experiment_now(run) for run in (plain, no_max, no_shield)]
+    planners = [cast("ImplicitPlanner", experiment.method_settings.high) for experiment in experiments]
+    assert [planner.max_operator for planner in planners] == [True, False, True]
+    assert [experiment.config.shield.enabled for experiment in experiments] == [True, True, False]
 
 
 def test_every_method_is_tuned_alike() -> None:
@@ -106,7 +95,7 @@ def test_every_method_is_tuned_alike() -> None:
         for run in runs:
             experiment = experiment_now(run)
             kind = (run.curve.recipe, run.curve.method)
-            tried.setdefault(kind, []).append(experiment.config.low.learning_rate)
+            tried.setdefault(kind, []).append(experiment.config.low.optimiser.learning_rate)
         assert len(tried) == 6
         assert all(rates == list(TRIED[(env, recipe)]) for (recipe, _), rates in tried.items())
         panels = [other for name, other in PANELS.items() if name.startswith(env)]
@@ -116,60 +105,30 @@ def test_every_method_is_tuned_alike() -> None:
 @pytest.mark.parametrize("panel", TUNING.values(), ids=lambda panel: panel.env)
 def test_presets_have_the_rates_that_tuning_chose(panel: Panel) -> None:
     """The trials whose records are kept, as far as all of a method's are there."""
-    trials: dict[tuple[Recipe, Method], dict[float, float]] = {}
-    for run in panel.runs(1, None):
-        kept = read_run(run, KEPT)
-        if kept is not None:
-            experiment = experiment_now(run)
-            rate = experiment.config.low.learning_rate
-            score = mean_return(kept) + final_return(kept)
-            trials.setdefault((run.curve.recipe, run.curve.method), {})[rate] = score
+    trials: dict[tuple[Recipe, str], dict[float, float]] = {}
+    for run, kept in read_records(panel.runs(1, None), KEPT).items():
+        rate = experiment_now(run).config.low.optimiser.learning_rate
+        score = mean_return(kept) + final_return(kept)
+        trials.setdefault((run.curve.recipe, run.curve.method), {})[rate] = score
     for (recipe, method), means in trials.items():
         if len(means) == len(TRIED[panel.env, recipe]):
             best = max(means, key=lambda rate: means[rate])
-            assert preset(panel.env, recipe, 2, method).low.learning_rate == best
+            assert preset(panel.env).settings(method, recipe, 2)[0].low.optimiser.learning_rate == best
 
 
 def test_kept_records_are_of_what_their_flags_mean_today() -> None:
     """Whoever changes a preset makes the runs with it again, and deletes their records for that."""
-    every = [run for panel in (PANELS | TUNING).values() for run in panel.runs(5, None)]
-    for run in dict.fromkeys(every):
-        kept = read_run(run, KEPT)
-        if kept is not None:
-            experiment = experiment_now(run)
-            assert effective(experiment_of(kept["config"], run.name)) == effective(experiment), run.name
-
-
-def effective(experiment: Experiment) -> Experiment:
-    """Without the settings of a shield that is off and of a planner that is not there."""
-    config = experiment.config
-    if config.shield.mode == "off":
-        config = dataclasses.replace(config, shield=ShieldConfig(mode="off"))
-    if not config.plans:
-        config = dataclasses.replace(config, high=PPOConfig())
-    return dataclasses.replace(experiment, config=config)
+    kept = read_records([run for panel in (PANELS | TUNING).values() for run in panel.runs(5, None)], KEPT)
+    assert kept
+    for run, found in kept.items():
+        assert effective(found.settings) == effective(dataclasses.asdict(experiment_now(run))), run.name
 
 
 def test_the_tasks_of_the_trajectories_are_tasks() -> None:
     names = envs_jax.make("walk").propositions
-    trees = [compile(parse(text), names, max_nodes=16) for text in TRAJECTORY_TASKS]
+    trees = [compile_task(parse(text), names, max_nodes=16) for text in TRAJECTORY_TASKS]
     assert len({int(tree.depth.max()) for tree in trees}) > 1
     assert trajectory_run(None) in PANELS["walk-set1"].runs(1, None)
-
-
-def test_records_are_kept_for_the_steps_they_were_asked_for(tmp_path: Path) -> None:
-    short, long = (Run("walk", 1, Curve("ours", "paper"), 0, steps) for steps in (100, 200))
-    assert read_run(short, tmp_path) is None
-    kept = write_run(short, record([0.5], 0.5), tmp_path)
-    assert kept == record_file(short, tmp_path)
-    found = read_run(short, tmp_path)
-    assert found is not None
-    assert final_return(found) == 0.5
-    assert "--total-steps 100" in found["flags"]
-    assert read_run(long, tmp_path) is None
-    kept.write_text("{")
-    with pytest.raises(UserError, match="cannot read"):
-        read_run(short, tmp_path)
 
 
 def test_scores_of_a_record() -> None:
@@ -205,16 +164,17 @@ def test_the_report_is_drawn_from_records_alone_and_always_the_same(tmp_path: Pa
     panel = PANELS["letter-techniques"]
     records = {run: record([0.1 * run.seed, 0.5], 0.5 + 0.1 * run.seed) for run in panel.runs(3, None)}
     unknown = next(run for run in records if run.curve.switches == ("--no-shield",))
-    records[unknown]["final"]["suite"]["spl"] = None
-    records[unknown]["final"]["contested_choice"] = None
+    final = records[unknown].final
+    unscored = {**final, "suite": {**final["suite"], "spl": None}, "contested_choice": None}
+    records[unknown] = dataclasses.replace(records[unknown], final=unscored)
     contents = []
     for name in ("one", "two"):
         place = tmp_path / name
         files = list(write_report([panel, PANELS["walk-set1"]], records, place / "figures", place / "docs" / "page.md"))
-        assert [file.name for file in files] == ["letter-techniques.png", "letter-techniques.svg", "page.md"]
+        assert [file.name for file in files] == ["letter-techniques.png", "page.md"]
         contents.append([file.read_bytes() for file in files])
     assert contents[0] == contents[1]
-    page = contents[0][2].decode()
+    page = contents[0][1].decode()
     assert "](../figures/letter-techniques.png)" in page
     assert "| ours without max operator (paper) | 3 | 0.600 [0.500, 0.700] | 0.600 | 50 | 0.600 | 0.600 |" in page
     assert "| ours without shield (paper) | 3 | 0.600 [0.500, 0.700] | 0.600 | 50 |  |  |" in page
@@ -249,24 +209,31 @@ def test_bad_input(flags: str, message: str, tmp_path: Path, monkeypatch: pytest
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="runs are free where cores cannot be chosen")
+def test_only_a_checkout_has_records_to_work_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=r"has no experiments/reproduce\.py: clone the repository and run reproduce in"):
+        reproduce.main(["--draw-only"])
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="cores cannot be chosen")
 def test_runs_side_by_side_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {2, 3, 5, 7})
     monkeypatch.setattr(subprocess, "run", lambda *args, **kwargs: subprocess.CompletedProcess(args, 0, "cpu 1", ""))
-    shares = {jobs: [list(place.cores) for place in reproduce._places(jobs)] for jobs in (None, 1, 2, 3, 6)}
+    shares = {jobs: [list(place.cores) for place in making.places(jobs)] for jobs in (None, 1, 2, 3, 6)}
     assert shares[None] == [[2], [3], [5], [7]]
     assert shares[1] == [[2, 3, 5, 7]]
     assert shares[2] == [[2, 5], [3, 7]]
     assert shares[3] == [[2, 7], [3], [5]]
     assert shares[6] == [[2], [3], [5], [7], [2], [3]]
     monkeypatch.setattr(subprocess, "run", lambda *args, **kwargs: subprocess.CompletedProcess(args, 0, "gpu 2", ""))
-    assert [place.variables for place in reproduce._places(3)] == [{"CUDA_VISIBLE_DEVICES": n} for n in "010"]
+    assert [place.variables for place in making.places(3)] == [{"CUDA_VISIBLE_DEVICES": n} for n in "010"]
 
 
 def test_a_dry_run_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     panel = PANELS["walk-set1"]
     done = panel.runs(1, None)[0]
-    write_run(done, record([0.5], 0.5), tmp_path)
+    add_record(done, record([0.5], 0.5), tmp_path)
     reproduce.main(["--only", "walk-set1", "--seeds", "2", "--dry-run", "--out", str(tmp_path)])
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 11
@@ -275,15 +242,38 @@ def test_a_dry_run_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFi
 
 def test_what_is_there_can_be_drawn_without_what_is_missing(tmp_path: Path) -> None:
     for run in PANELS["walk-set1"].runs(1, None)[:2]:
-        write_run(run, record([0.5], 0.5), tmp_path)
+        add_record(run, record([0.5], 0.5), tmp_path)
     page = tmp_path / "page.md"
     reproduce.main(["--draw-only", "--out", str(tmp_path), "--report", str(page), "--work", str(tmp_path / "work")])
     assert "| ltl2action (paper) | 1 | 0.500" in page.read_text()
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["page.md", "walk", "walk-set1.png", "walk-set1.svg"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["page.md", "walk-paper.jsonl", "walk-set1.png"]
 
 
-def test_what_is_cut_goes_on_and_what_fails_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two real runs, tiny ones: stopped on the way, then ended by the same command; a third one that fails."""
+STOPPED = """
+import os, pathlib, signal, sys, time
+from hrlspec.run.folder import open_run
+folder, row = pathlib.Path(sys.argv[1]), dict.fromkeys(sys.argv[3:], 0.5)
+signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
+signal.alarm(300)  # it never outlives its test
+with open_run(folder, {"seed": 0}, resume=sys.argv[2] == "resume", tensorboard=False) as run:
+    if run.resumed:
+        run.rewind(50)
+        run.append({**row, "env_steps": 100})
+        run.write_summary({"env_steps": 100, "wall_s": 1.0, "final": {"suite": {"return_mean": 0.5}}})
+    else:
+        run.append({**row, "env_steps": 50})
+        if "no-max-operator" in folder.name:
+            while len(list(folder.parent.glob("*/metrics.jsonl"))) < 2:
+                time.sleep(0.01)
+            os.kill(os.getppid(), signal.SIGTERM)
+        signal.sigwait([signal.SIGTERM])
+        sys.exit(130)
+"""
+"""A run that has the program above it stopped, once both of two runs are half done; resumed, it finishes."""
+
+
+def test_what_is_stopped_goes_on_and_what_fails_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two runs: stopped on the way, then ended by the same command; a third one that fails."""
     where = ["--out", str(tmp_path / "out"), "--work", str(tmp_path / "work"), "--report", str(tmp_path / "page.md")]
     flags = ["--only", "letter-techniques", "--recipes", "paper", "--seeds", "1", "--jobs", "2", *where]
     started: list[str] = []
@@ -292,29 +282,42 @@ def test_what_is_cut_goes_on_and_what_fails_is_said(tmp_path: Path, monkeypatch:
         started.append(run.name)
         if "no-shield" in run.name:
             return [sys.executable, "-c", "raise SystemExit(2)"]
-        folder = work / run.name
-        resume = ["--resume"] if (folder / "config.json").exists() else []
-        return [sys.executable, "-m", "experiments.run", *arguments(folder), *resume]
+        how = "resume" if "--resume" in making_command(run, work) else "begin"
+        return [sys.executable, "-c", STOPPED, str(work / run.name), how, *CURVE]
 
-    monkeypatch.setattr(reproduce, "_command", command)
-    monkeypatch.setattr(reproduce, "POLL_SECONDS", 0.1)
-    timer = threading.Timer(6.0, os.kill, (os.getpid(), signal.SIGTERM))
-    timer.start()
+    making_command = making.command
+    monkeypatch.setattr(making, "command", command)
+    monkeypatch.setattr(making, "POLL_SECONDS", 0.1)
     with pytest.raises(Interrupted, match="the same command goes on"):
         reproduce.main(flags)
     assert len(started) == 2
+    assert not (tmp_path / "out").exists()
     with pytest.raises(UserError, match="1 runs failed, the first is letter-ours-paper-set2-no-shield-seed0"):
         reproduce.main(flags)
-    kept = sorted(file.name for file in (tmp_path / "out" / "letter").iterdir())
-    assert kept == ["letter-ours-paper-set2-no-max-operator-seed0.json", "letter-ours-paper-set2-seed0.json"]
-    assert json.loads((tmp_path / "out" / "letter" / kept[0]).read_text())["rows"]
+    runs = PANELS["letter-techniques"].runs(1, None)
+    kept = read_records(runs, tmp_path / "out")
+    assert [run.curve.switches for run in kept] == [(), ("--no-max-operator",)]
+    assert [record.curve["env_steps"] for record in kept.values()] == [[50, 100]] * 2
     # What is done is not done again.
     before = len(started)
     monkeypatch.setattr(subprocess, "Popen", lambda *args, **kwargs: pytest.fail("started again"))
-    panel = PANELS["letter-techniques"]
-    monkeypatch.setitem(
-        reproduce.PANELS, "letter-techniques", type(panel)(**{**vars(panel), "curves": panel.curves[:2]})
-    )
+    panel = dataclasses.replace(PANELS["letter-techniques"], curves=tuple(run.curve for run in kept))
+    monkeypatch.setitem(reproduce.PANELS, "letter-techniques", panel)
     reproduce.main(flags)
     assert len(started) == before
     assert "letter-techniques" in (tmp_path / "page.md").read_text()
+
+
+def test_a_real_run_leaves_a_record(tmp_path: Path) -> None:
+    """A tiny one, by the command that makes the others."""
+    run = Run("letter", 1, Curve("ours", "hrlspec"), 0, TOTAL)
+    subprocess.run([sys.executable, "-m", "experiments.run", *arguments(tmp_path / run.name)], check=True)
+    found = record_of(tmp_path / run.name)
+    assert found is not None
+    assert found.curve["env_steps"][-1] == found.env_steps == TOTAL
+    assert None not in found.curve["train/violations"]
+    by_depth = found.final["suite"]["per_depth"]
+    assert len(by_depth["depth"]) == len(by_depth["success_rate_interval"]) > 0
+    assert 0 <= final_return(found) <= 1
+    add_record(run, found, tmp_path)
+    assert read_records([run], tmp_path) == {run: found}

@@ -1,0 +1,90 @@
+"""Settings of kept records under the names that they have today.
+
+Records are never edited, so those made before a setting was renamed have its old name.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+_OPTIMISER = ("learning_rate", "final_learning_rate", "epochs", "minibatches", "max_grad_norm")
+_LEVELS = {"low": "config.low", "high": "method_settings.high.ppo"}
+_PLANNER = "method_settings.high"
+
+RENAMED = {
+    "config.relabel.visits": "config.relabel.hindsight",
+    "config.shield.learning_rate": "config.shield.optimiser.learning_rate",
+    "config.shield.minibatches": "config.shield.optimiser.minibatches",
+    "config.max_operator": f"{_PLANNER}.max_operator",
+    "config.unfinished": f"{_PLANNER}.learns_unfinished",
+    "config.relabel.planner_policy": f"{_PLANNER}.learns_from_copies",
+    "config.planner_share": f"{_PLANNER}.steps_per_sample",
+    "config.transe": f"{_PLANNER}.transe",
+    "config.transe_margin": f"{_PLANNER}.transe_margin",
+    "config.network.advised": f"{_PLANNER}.advised",
+    "config.network.advice": f"{_PLANNER}.network.advice",
+    "config.network.child_embeddings": f"{_PLANNER}.network.child_embeddings",
+    **{f"config.network.planner_{n}": f"{_PLANNER}.network.{n}" for n in ("features", "hidden", "policy", "rounds")},
+    **{f"config.{level}.{n}": f"{now}.optimiser.{n}" for level, now in _LEVELS.items() for n in _OPTIMISER},
+    **{f"config.{level}.most_ratio": f"{now}.dual_clip" for level, now in _LEVELS.items()},
+    **{f"config.{level}.relative": f"{now}.advantage_scale" for level, now in _LEVELS.items()},
+}
+GONE = {"config.low.expectile": 0.5, "config.high.expectile": 0.5}
+"""Settings with the value that the code has today."""
+NEW = {
+    "config.shield.optimiser.final_learning_rate": 1e-3,
+    "config.shield.optimiser.epochs": 1,
+    "config.shield.optimiser.max_grad_norm": 1.0,
+}
+"""Settings with the value that the code had before."""
+OF_METHODS = {
+    "config.future_embedding": "myopic-low option",
+    "config.options": "option",
+    "config.network.whole_task": "ltl2action",
+}
+"""Settings that methods have taken the place of: where each was not what it was for ours."""
+OWN = {"option": {f"{_PLANNER}.sharpness": 100.0, f"{_PLANNER}.fading": 0.98}}
+"""Settings of methods without a planner, with the value that the code had before."""
+
+
+def dotted(settings: Any, prefix: str = "") -> dict[str, Any]:
+    """Nested settings by dotted names."""
+    if not isinstance(settings, dict):
+        return {prefix: settings}
+    return {
+        name: value
+        for key, inner in settings.items()
+        for name, value in dotted(inner, f"{prefix}.{key}" if prefix else key).items()
+    }
+
+
+def effective(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as a run folder keeps them, old or new, by today's names; without those of a shield that is off."""
+    now = dotted(json.loads(json.dumps(settings)))
+    if "method_settings" not in settings:
+        now = _renamed(now)
+    if not now["config.shield.enabled"]:
+        now = {name: value for name, value in now.items() if not name.startswith("config.shield.")}
+    return now
+
+
+def _renamed(old: Mapping[str, Any]) -> dict[str, Any]:
+    method = old["method"]
+    for name, methods in OF_METHODS.items():
+        assert old[name] == ((method in methods.split()) != (name == "config.future_embedding")), name
+    for name, value in GONE.items():
+        assert old[name] == value, name
+    left = {name: value for name, value in old.items() if name not in OF_METHODS and name not in GONE}
+    mode = left.pop("config.shield.mode")
+    now = {_rename(name): value for name, value in left.items()}
+    if method in ("ltl2action", "option"):
+        now = {name: value for name, value in now.items() if not name.startswith(_PLANNER)}
+    return now | NEW | OWN.get(method, {}) | {"config.shield.enabled": mode == "state"}
+
+
+def _rename(name: str) -> str:
+    if name in RENAMED:
+        return RENAMED[name]
+    return name.replace("config.high.", f"{_PLANNER}.ppo.")
