@@ -16,7 +16,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,19 +24,19 @@ import numpy as np
 
 import envs_jax
 from hrlspec.agent.agent import Agent
-from hrlspec.learning.rollout import collect, fill_pool
+from hrlspec.learning.rollout import Setting, collect, fill_pool
 from hrlspec.learning.train import Trainer
-from hrlspec.presets.settings import preset, rewards_of
+from hrlspec.presets import Recipe, preset
 from hrlspec.run.platform import prepare
 from hrlspec.run.programs import Program
-from hrlspec.tasks.curriculum import draw_bank
+from hrlspec.tasks.bank import TaskBanks
 
 
 @dataclasses.dataclass(frozen=True)
 class CommonFlags:
     """What to measure; each script adds its environments."""
 
-    recipes: tuple[Literal["paper", "hrlspec"], ...] = ("paper", "hrlspec")
+    recipes: tuple[Recipe, ...] = ("paper", "hrlspec")
     seconds: float = 10.0
     """At least this long for each figure, compile time apart."""
     out: Path | None = None
@@ -111,15 +111,19 @@ def environment(
     return rate(roll, (jax.random.key(1), state, observation), num_envs * num_steps, seconds)
 
 
-def training(name: str, recipe: str, seconds: float) -> dict[str, Any]:
-    """Rollout alone, and whole iterations with every technique of the recipe, at the last curriculum level."""
-    env, config, machine = envs_jax.make(name), preset(name, recipe, 1, "ours"), rewards_of(name, 1)
-    agent = Agent(env, config)
-    trainer = Trainer(agent)
+def learner(name: str, recipe: Recipe) -> tuple[Trainer, Any, Any]:
+    """The paper's method with a recipe's settings, a bank of training tasks, and the rewards of set 1."""
+    some = preset(name)
+    trainer = Trainer(Agent(some.make(), *some.settings("ours", recipe)))
     nothing = np.zeros(0, np.uint32)
-    bank = jax.tree.map(
-        jnp.asarray, draw_bank(np.random.default_rng(0), config.curriculum, env.num_propositions, nothing)
-    )
+    banks = TaskBanks(0, trainer.agent.config.curriculum, trainer.agent.env.num_propositions, nothing)
+    return trainer, banks.at(0), some.rewards()
+
+
+def training(name: str, recipe: Recipe, seconds: float) -> dict[str, Any]:
+    """Rollout alone, and whole iterations with every technique of the recipe, at the last curriculum level."""
+    trainer, bank, machine = learner(name, recipe)
+    agent, config = trainer.agent, trainer.agent.config
     reserved = jnp.zeros(1, jnp.uint32)
     state = trainer.init(jax.random.key(0), bank, machine)
     # Some learning first: episodes of an untrained agent are longer, and have fewer decisions.
@@ -130,16 +134,16 @@ def training(name: str, recipe: str, seconds: float) -> dict[str, Any]:
     @jax.jit
     def roll(collector: Any) -> Any:
         tasks = jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank)
-        book = agent.open_book(state.params, tasks)
-        pool = fill_pool(jax.random.key(1), agent, book, state.curriculum.level, config.episode_slots)
-        return collect(
-            jax.random.key(2), agent, state.params, machine, book, collector, pool, config.noise_correlation
-        )[0]
+        book = agent.low.open_book(state.params, tasks)
+        pool = fill_pool(jax.random.key(1), agent, book, state.curriculum.level, size=config.episode_slots)
+        setting = Setting(agent, state.params, machine, book, pool)
+        return collect(jax.random.key(2), setting, collector, config.noise_correlation)[0]
 
     result["rollout_steps_per_s"] = rate(roll, state.collector, config.steps_per_iteration, seconds)
     iterate = functools.partial(_iterate, trainer, bank, machine, reserved)
     result["training_steps_per_s"] = rate(iterate, state, config.steps_per_iteration, seconds)
     result["config"] = dataclasses.asdict(config)
+    result["method"] = dataclasses.asdict(agent.method)
     return result
 
 
@@ -147,13 +151,10 @@ def _iterate(trainer: Trainer, bank: Any, machine: Any, reserved: Any, state: An
     return trainer.iterate(state, bank, machine, reserved)[0]
 
 
-def start(name: str, recipe: str) -> dict[str, float]:
+def start(name: str, recipe: Recipe) -> dict[str, float]:
     """Seconds that the training state took, and those that the first iteration took, in this process."""
-    env, config, machine = envs_jax.make(name), preset(name, recipe, 1, "ours"), rewards_of(name, 1)
-    trainer = Trainer(Agent(env, config))
+    trainer, bank, machine = learner(name, recipe)
     init, iterate = (Program(name, getattr(Trainer, name), trainer) for name in ("init", "iterate"))
-    bank = draw_bank(np.random.default_rng(0), config.curriculum, env.num_propositions, np.zeros(0, np.uint32))
-    bank = jax.tree.map(jnp.asarray, bank)
     before = time.perf_counter()
     state = jax.block_until_ready(init(jax.random.key(0), bank, machine))
     between = time.perf_counter()

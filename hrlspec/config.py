@@ -33,7 +33,7 @@ class Checked:
             found = getattr(self, field.name)
             for value in found if isinstance(found, tuple) else (found,):
                 if isinstance(value, int | float) and not least <= value <= most:
-                    bounds = f"at least {least:g}" if most == math.inf else f"a number from {least:g} to {most:g}"
+                    bounds = f"at least {least:g}" if most == math.inf else f"a number from {least:g} to {most:.10g}"
                     raise ConfigError(f"{type(self).__name__}.{field.name} is {found}, expected {bounds}")
 
 

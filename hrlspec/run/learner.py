@@ -11,8 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs_jax import Environment
-from hrlspec.agent.agent import Agent, Params
+from hrlspec.agent.low_level import Params
 from hrlspec.evaluation import (
     ChoiceResult,
     ReturnResult,
@@ -24,19 +23,15 @@ from hrlspec.evaluation import (
     periodic_evaluation,
     return_evaluation,
 )
-from hrlspec.exact.contested import can_contest
+from hrlspec.exact.contested import Contestable
 from hrlspec.learning.train import Trainer, TrainState
-from hrlspec.presets.settings import rewards_of
 from hrlspec.presets.suites import load_suite, reserved_hashes, suite_names
 from hrlspec.run.errors import UserError
-from hrlspec.run.experiment import Experiment, environment_of
+from hrlspec.run.experiment import Experiment
 from hrlspec.run.loop import Job
 from hrlspec.run.programs import Program
-from hrlspec.spec import TaskTree
-from hrlspec.tasks.curriculum import draw_bank
-from hrlspec.tasks.rewards import RewardMachine
+from hrlspec.tasks.bank import TaskBanks
 
-BANK_ITERATIONS = 16  # a bank of training tasks serves this many iterations
 PERIODIC_TASKS = 10
 _EVALUATION_STREAM, _FINAL_STREAM = 1, 2  # of random numbers, apart from training's
 
@@ -73,17 +68,16 @@ class Learner:
 
     def __init__(self, experiment: Experiment) -> None:
         self.experiment = experiment
-        self.env: Environment = environment_of(experiment)
-        self.agent = Agent(self.env, experiment.config)
+        self.agent = experiment.agent
+        self.env = self.agent.env
         self.trainer = Trainer(self.agent)
         self._init_program = Program("init", Trainer.init, self.trainer)
         self._iterate_program = Program("iterate", Trainer.iterate, self.trainer)
-        self.machine: RewardMachine = rewards_of(experiment.env, experiment.reward_set)
-        self._reserved = reserved_hashes(experiment.env)
-        self._reserved_on_device = jnp.asarray(self._reserved)
-        self._bank: tuple[int, TaskTree] | None = None
+        self.machine = experiment.rewards
+        reserved = reserved_hashes(experiment.env)
+        self._reserved = jnp.asarray(reserved)
         try:
-            self._bank_of(0)
+            self._banks = TaskBanks(experiment.seed, experiment.config.curriculum, self.env.num_propositions, reserved)
         except ValueError as error:
             raise UserError(f"no training tasks with this --config.curriculum: {error}") from error
 
@@ -108,7 +102,7 @@ class Learner:
         suite = self.test_suite.take(_spread(len(self.test_suite), settings.final_tasks))
         result = final_evaluation(self.env, suite, episodes=len(suite), greedy=settings.greedy)(keys[0], *how)
         choice = returns = None
-        if settings.contested and can_contest(self.env):
+        if settings.contested and isinstance(self.env, Contestable):
             evaluation = choice_evaluation(self.env, num_cases=settings.contested, greedy=settings.greedy)
             choice = evaluation(keys[1], *how)
         if self.experiment.reward_set == 2 and "branches" in suite_names(self.experiment.env):
@@ -131,23 +125,14 @@ class Learner:
 
     def _init(self) -> TrainState:
         key = jax.random.key(self.experiment.seed)
-        state: TrainState = self._init_program(key, self._bank_of(0), self.machine)
+        state: TrainState = self._init_program(key, self._banks.at(0), self.machine)
         return state
 
     def _iterate(self, state: TrainState, index: int) -> tuple[TrainState, Mapping[str, jax.Array]]:
-        bank = self._bank_of(index // BANK_ITERATIONS)
         result: tuple[TrainState, Mapping[str, jax.Array]] = self._iterate_program(
-            state, bank, self.machine, self._reserved_on_device
+            state, self._banks.at(index), self.machine, self._reserved
         )
         return result
-
-    def _bank_of(self, number: int) -> TaskTree:
-        """A bank depends on the seed and its number alone, so that a resumed run draws the same ones."""
-        if self._bank is None or self._bank[0] != number:
-            rng = np.random.default_rng([self.experiment.seed, number])
-            bank = draw_bank(rng, self.experiment.config.curriculum, self.env.num_propositions, self._reserved)
-            self._bank = number, jax.tree.map(jnp.asarray, bank)
-        return self._bank[1]
 
     def _evaluate(self, state: TrainState, env_steps: int) -> dict[str, Any]:
         key = jax.random.fold_in(self._key(_EVALUATION_STREAM), env_steps % 2**32)

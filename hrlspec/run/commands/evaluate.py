@@ -16,14 +16,14 @@ import jax
 import numpy as np
 
 from hrlspec import checkpoint
-from hrlspec.agent.agent import Agent, Params
+from hrlspec.agent.agent import Agent
+from hrlspec.agent.low_level import Params
 from hrlspec.evaluation import Suite, evaluate_suite, suite_from_text
 from hrlspec.evaluation.suite import MAX_NODES
-from hrlspec.presets.settings import rewards_of
 from hrlspec.presets.suites import load_suite
 from hrlspec.run import platform
 from hrlspec.run.errors import UserError
-from hrlspec.run.experiment import Experiment, environment_of, experiment_of
+from hrlspec.run.experiment import Experiment, experiment_of
 from hrlspec.run.flags import parse_flags
 from hrlspec.run.folder import read_record
 from hrlspec.run.tables import result_console, suite_table
@@ -82,14 +82,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     experiment = experiment_of(read_record(flags.run)["config"], str(flags.run))
     suite = tasks_of(flags, experiment)
     platform.prepare(experiment.env, experiment.recipe)
-    agent = Agent(environment_of(experiment), experiment.config)
+    agent = experiment.agent
     params, step = load_params(agent, flags.run, flags.step)
     try:
         result = evaluate_suite(
             jax.random.fold_in(jax.random.key(flags.seed), 1),
             agent,
             params,
-            rewards_of(experiment.env, experiment.reward_set),
+            experiment.rewards,
             suite,
             layouts_per_task=-(-flags.episodes // len(suite)),
             seed=flags.seed,
@@ -118,7 +118,7 @@ def _draw(flags: EvaluateFlags, agent: Agent, params: Params, experiment: Experi
 
     assert flags.draw is not None
     some = suite.take(np.arange(min(len(suite), MOST_PICTURES)))
-    machine = rewards_of(experiment.env, experiment.reward_set)
+    machine = experiment.rewards
     episodes = plots.episodes_of(jax.random.key(flags.seed), agent, params, machine, some)
     flags.draw.parent.mkdir(parents=True, exist_ok=True)
     plots.gallery(episodes, agent.env.propositions, flags.draw)
@@ -150,7 +150,7 @@ def tasks_of(flags: EvaluateFlags, experiment: Experiment) -> Suite:
     else:
         assert flags.spec_file is not None
         name, text = flags.spec_file.name, _read(flags.spec_file)
-    return suite_from_text(name, text, environment_of(experiment).propositions, max_nodes=flags.max_nodes)
+    return suite_from_text(name, text, experiment.preset.make().propositions, max_nodes=flags.max_nodes)
 
 
 def _read(file: Path) -> str:

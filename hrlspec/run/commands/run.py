@@ -17,11 +17,12 @@ from rich.console import Console
 from hrlspec.evaluation import SuiteResult, aggregate
 from hrlspec.run import platform
 from hrlspec.run.errors import Interrupted, UserError
-from hrlspec.run.experiment import Experiment, RunFlags, experiment_of, experiments_of, parse_run
+from hrlspec.run.experiment import Experiment, experiment_of
 from hrlspec.run.folder import RunFolder, open_run, read_metrics, read_record, read_summary
 from hrlspec.run.learner import Learner
 from hrlspec.run.loop import DivergedError, Loop
 from hrlspec.run.progress import ProgressDisplay, duration
+from hrlspec.run.run_flags import RunFlags, experiments_of, parse_run
 from hrlspec.run.tables import aggregate_table, final_tables, result_console
 
 

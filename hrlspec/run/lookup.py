@@ -1,0 +1,70 @@
+"""What ``--env`` and ``--method`` name: an entry of the library, or anybody's value as ``module:attribute``."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import os
+import sys
+from typing import TypeVar
+
+from envs_jax import Environment
+from hrlspec.methods import METHODS, Method
+from hrlspec.presets import PRESETS, Preset, preset, preset_for
+from hrlspec.run.errors import UserError
+
+T = TypeVar("T")
+
+
+@functools.cache
+def preset_named(name: str) -> Preset:
+    """A preset of the library, or one made for the environment at ``module:attribute``.
+
+    Raises:
+        UserError: there is nothing of that name, or it is no environment.
+    """
+    if ":" in name:
+        expected = "an environment that keeps the contract in envs_jax/base.py"
+        return preset_for(_load(name, Environment, expected))  # type: ignore[type-abstract]
+    if name not in PRESETS:
+        raise UserError(f"unknown environment {name!r}, expected one of {', '.join(PRESETS)}, or module:factory")
+    return preset(name)
+
+
+@functools.cache
+def method_named(name: str) -> Method:
+    """A method of the library, or the value at ``module:attribute``.
+
+    Raises:
+        UserError: there is nothing of that name, or it is no method.
+    """
+    if ":" in name:
+        return _load(name, Method, "a value of a subclass of hrlspec.methods.Method")
+    if name not in METHODS:
+        raise UserError(f"unknown method {name!r}, expected one of {', '.join(METHODS)}, or module:VALUE")
+    return METHODS[name]
+
+
+def _load(name: str, kind: type[T], expected: str) -> T:
+    """The value at ``module:attribute``, or what it returns when called. The current directory is searched first.
+
+    Raises:
+        UserError: it cannot be had, or is of another kind, or cannot be hashed, as static arguments must be.
+    """
+    module_name, _, attribute = name.partition(":")
+    if os.getcwd() not in sys.path:  # console scripts do not have it there
+        sys.path.insert(0, os.getcwd())
+    try:
+        found = importlib.import_module(module_name)
+        for part in attribute.split("."):
+            found = getattr(found, part)
+        value = found if isinstance(found, kind) or not callable(found) else found()
+        if not isinstance(value, kind):
+            raise UserError(f"{name} is of type {type(value).__name__}, expected {expected}")
+        hash(value)
+    except UserError:
+        raise
+    except Exception as error:  # anything, since it is not our code
+        said = " ".join(str(error).split()) or "without a message"
+        raise UserError(f"{name} cannot be used: {type(error).__name__}: {said}") from error
+    return value

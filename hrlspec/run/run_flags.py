@@ -1,0 +1,173 @@
+"""What ``hrlspec run`` can be told, and what it makes of it: one `Experiment` for each seed."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import typing
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import arg
+
+from hrlspec.config import Checked, Config, ConfigError, evolve, setting
+from hrlspec.methods import METHODS, OURS, Method
+from hrlspec.presets import PRESETS, Recipe, RewardSet
+from hrlspec.run.errors import UserError
+from hrlspec.run.experiment import EvaluationConfig, Experiment
+from hrlspec.run.flags import in_flags, parse_flags
+from hrlspec.run.lookup import method_named, preset_named
+
+_LAST_SEED = 2**31 - 1
+
+
+@dataclasses.dataclass(frozen=True)
+class RunFlags(Checked):
+    """Trains an agent, evaluates it on tasks it never saw, and writes everything into a run folder.
+
+    --config.* and --method.* show the settings of the chosen environment, method, recipe and reward set, and override
+    them.
+    """
+
+    env: str = "letter"
+    """A name from above, or module:factory."""
+    method: str = "ours"
+    """A name from above, or module:VALUE."""
+    recipe: Recipe = "hrlspec"
+    """paper: the paper's method, made to learn; hrlspec: what was measured to be better."""
+    reward_set: RewardSet = 1
+    """1: 1 for completing the task; 2: also for sub-tasks and for visiting some in order."""
+    seed: int = setting(0, least=0, most=_LAST_SEED)
+    num_seeds: int = setting(1, least=1)
+    """Seeds to run one after another, from --seed on, each in a folder of its own."""
+    total_steps: int | None = None
+    """Environment steps; the preset's if not given."""
+    out: Path | None = None
+    """The run folder; runs/<name> if not given. With several seeds, the folder that holds seed<n>/."""
+    resume: bool = False
+    """Continue what is in the folder, with the flags it was begun with; finished seeds are skipped."""
+    checkpoint_minutes: float = setting(1.0, least=0, most=1e6)
+    """How much work a kill may cost."""
+    no_max_operator: bool = False
+    """Targets of the low level without the planner's value of what remains."""
+    no_shield: bool = False
+    """Collect without replacing actions that would step on forbidden propositions."""
+    no_relabel: bool = False
+    """No experience relabelled into other tasks."""
+    no_curriculum: bool = False
+    """All levels from the start, in equal shares."""
+    no_transe: bool = False
+    """No loss that shapes the planner's latent transitions."""
+    evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
+    config: Config = dataclasses.field(default_factory=Config)
+    method_settings: Annotated[Method, arg(name="method")] = OURS
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.seed + self.num_seeds - 1 > _LAST_SEED:
+            raise ConfigError(
+                f"RunFlags.num_seeds is {self.num_seeds}, expected the last seed to be at most {_LAST_SEED}"
+            )
+
+
+def parse_run(argv: Sequence[str], *, program: str = "hrlspec run") -> RunFlags:
+    """The flags of ``hrlspec run``; presets fill in what is not given.
+
+    Raises:
+        UserError: something is not allowed.
+    """
+    chosen = _chosen(argv)
+    name = chosen["method"]
+    config, method = preset_named(chosen["env"]).settings(
+        name if name in METHODS else method_named(name), chosen["recipe"], chosen["reward_set"]
+    )
+    default = RunFlags(config=config, method_settings=method)
+    return parse_flags(RunFlags, argv, program=program, default=default, about=_about())
+
+
+def _chosen(argv: Sequence[str]) -> dict[str, Any]:
+    """The four flags that all other defaults depend on, as given; the default where it is not, or not allowed."""
+    scan = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    names = ("env", "method", "recipe", "reward_set")
+    for name in names:
+        scan.add_argument(f"--{name.replace('_', '-')}", f"--{name}", dest=name, default=None)
+    try:
+        seen = vars(scan.parse_known_args(list(argv))[0])
+    except argparse.ArgumentError:
+        seen = {}  # tyro says it better
+    hints = typing.get_type_hints(RunFlags)
+    default: dict[str, Any] = {name: getattr(RunFlags, name) for name in names}
+    for name in names:
+        allowed = typing.get_args(hints[name]) or (seen.get(name),)  # any text, where the type is no Literal
+        default[name] = next((value for value in allowed if str(value) == seen.get(name)), default[name])
+    return default
+
+
+def _about() -> str:
+    """What the help begins with."""
+    methods = "\n".join(f"  {method.name}: {method.about}" for method in METHODS.values())
+    return (
+        f"{' '.join(str(RunFlags.__doc__).split())}\n\nEnvironments: {', '.join(PRESETS)}; any other as "
+        "--env module:factory, where calling factory makes it; the module is looked for in the current directory "
+        f"first.\n\nMethods, any other as --method module:VALUE:\n{methods}\n"
+    )
+
+
+def experiments_of(flags: RunFlags) -> list[tuple[Experiment, Path]]:
+    """The runs that the flags ask for and their folders.
+
+    Raises:
+        UserError: the settings do not make sense.
+    """
+    try:
+        config, method = _switched(flags)
+        method.high.check(config)
+    except ConfigError as error:
+        raise UserError(in_flags(error, flags)) from None
+    runs = []
+    for seed in range(flags.seed, flags.seed + flags.num_seeds):
+        experiment = Experiment(
+            env=flags.env,
+            method=flags.method,
+            recipe=flags.recipe,
+            reward_set=flags.reward_set,
+            seed=seed,
+            evaluation=flags.evaluation,
+            config=config,
+            method_settings=method,
+        )
+        if flags.out is None:
+            folder = Path("runs") / experiment.name
+        else:
+            folder = flags.out if flags.num_seeds == 1 else flags.out / f"seed{seed}"
+        runs.append((experiment, folder))
+    return runs
+
+
+def _switched(flags: RunFlags) -> tuple[Config, Method]:
+    """The settings with the short flags applied."""
+    changes: dict[str, Any] = {}
+    if flags.total_steps is not None:
+        changes["total_steps"] = flags.total_steps
+    if flags.no_shield:
+        changes["shield.enabled"] = False
+    if flags.no_relabel:
+        changes["relabel.share"] = 0.0
+    if flags.no_curriculum:
+        # Every verdict promotes, and "a level already passed" has the share of all levels but one.
+        levels = flags.config.curriculum.levels
+        changes |= {"curriculum.promotion": 0.0, "curriculum.window": 0, "curriculum.earlier": 1 - 1 / levels}
+    method = flags.method_settings
+    if flags.no_max_operator:
+        method = _without(method, "max-operator", {"max_operator": False})
+    if flags.no_transe:
+        method = _without(method, "transe", {"transe": 0.0})
+    return evolve(flags.config, changes), method
+
+
+def _without(method: Method, technique: str, changes: Mapping[str, Any]) -> Method:
+    try:
+        return method.replace(**changes)
+    except TypeError:
+        raise UserError(f"--no-{technique}: the method {method.name} has no such technique") from None
