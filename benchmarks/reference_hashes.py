@@ -40,7 +40,6 @@ from hrlspec.config import evolve
 from hrlspec.learning.train import Trainer
 from hrlspec.methods import METHODS, ImplicitPlanner
 from hrlspec.presets import RECIPES, Preset, Recipe, RewardSet, preset
-from hrlspec.presets.suites import reserved_hashes
 from hrlspec.tasks.curriculum import draw_bank
 
 RECORD = Path(__file__).with_suffix(".json")
@@ -81,7 +80,7 @@ def _trained(some: Preset, recipe: Recipe, method: str, reward_set: RewardSet) -
     env, machine = some.make(), some.rewards(reward_set)
     config, chosen = some.settings(method, recipe, reward_set)
     trainer = Trainer(Agent(env, config, chosen))
-    reserved = reserved_hashes(some.name)
+    reserved = some.reserved
 
     def bank(number: int) -> Any:
         rng = np.random.default_rng([0, number])

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from hrlspec.run.commands.evaluate import main
-from hrlspec.run.errors import main_guard
+from hrlspec.run.cli import call
 
 if __name__ == "__main__":
-    sys.exit(main_guard(main))
+    sys.exit(call("evaluate", program="python -m experiments.evaluate"))

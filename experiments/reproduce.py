@@ -28,10 +28,9 @@ from experiments.paper.panels import (
 from experiments.paper.records import read_records, record_of
 from hrlspec.presets import RECIPES
 from hrlspec.run.checkout import check_checkout
-from hrlspec.run.errors import UserError, main_guard
+from hrlspec.run.cli import call
+from hrlspec.run.errors import UserError
 from hrlspec.run.flags import parse_flags
-
-PROGRAM = "python -m experiments.reproduce"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,17 +60,18 @@ class ReproduceFlags:
     """Only draw figures and write the page, from the records there are."""
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+def main(argv: Sequence[str], *, program: str = "hrlspec reproduce") -> None:
     """The command line.
 
     Args:
-        argv: the arguments, those of the process by default.
+        argv: the arguments.
+        program: what to call it in messages.
 
     Raises:
         UserError: bad usage, no checkout, or a damaged folder or file of records.
         Interrupted: stopped by a signal; the runs have saved what they did.
     """
-    flags = parse_flags(ReproduceFlags, sys.argv[1:] if argv is None else argv, program=PROGRAM)
+    flags = parse_flags(ReproduceFlags, argv, program=program)
     _check(flags)
     check_checkout("reproduce")
     console = Console(stderr=True)
@@ -133,4 +133,4 @@ def _draw_trajectories(folder: Path, file: Path) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main_guard(main))
+    sys.exit(call("reproduce", program="python -m experiments.reproduce"))

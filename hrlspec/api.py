@@ -22,7 +22,6 @@ from hrlspec.config import evolve
 from hrlspec.evaluation import Suite, SuiteResult, evaluate_suite, suite_from_text
 from hrlspec.learning.train import Trainer, TrainState
 from hrlspec.presets import Preset, Recipe, RewardSet, preset, preset_for
-from hrlspec.presets.suites import reserved_hashes
 from hrlspec.spec import TaskTree
 from hrlspec.tasks.bank import TaskBanks, seed_of
 from hrlspec.tasks.rewards import RewardMachine
@@ -166,5 +165,4 @@ def _iterate_all(
 
 def _reserved(world: Preset, held_out: Suite | None) -> np.ndarray:
     """Sorted hashes of tasks that training must not see, uint32."""
-    own = reserved_hashes(world.name)
-    return own if held_out is None else np.union1d(own, held_out.hashes)
+    return world.reserved if held_out is None else np.union1d(world.reserved, held_out.hashes)

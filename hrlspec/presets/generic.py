@@ -1,12 +1,18 @@
-"""A preset for an environment that nobody tuned: settings by its spaces."""
+"""A preset for an environment that nobody tuned: settings by its spaces, and test tasks drawn from a seed."""
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
+import numpy as np
 
 from envs_jax import Box, Environment
+from hrlspec.evaluation import Suite, make_cases, suite_from_trees
 from hrlspec.presets.preset import Preset
 from hrlspec.presets.recipes import Recipe, Settings, continuous
+from hrlspec.presets.suite_rules import DAG, draw_suite, seed_of_suite
+from hrlspec.presets.suites import commented
 
 WIDE = 64
 """Numbers in a view from which on the latent has twice as many as Letter's."""
@@ -38,3 +44,37 @@ def preset_for(env: Environment) -> Preset:
         )
 
     return Preset(env.name, lambda: env, fit, quick_compile=True)
+
+
+def unseen_tasks(env: Environment, seed: int) -> str:
+    """Text of a test suite: random trees like those of the other worlds' suites ``dag``.
+
+    200 tasks of depth 2, 3 and 4; fewer where P is so small that there are few, of each depth at most a quarter of
+    those there are. Tasks of one sub-task are never among them. With one proposition there is only one task, which
+    cannot be kept from training: the suite is that task. Where there is an exact solver, tasks that can hardly ever be
+    satisfied within the horizon are left out.
+
+    Raises:
+        ValueError: no task is left.
+    """
+    (first, *others), where = env.propositions, f"{env.name}/dag"
+    if not others:
+        return commented([f"{where}: the only task there is, and so not unseen"], [f"achieve {first}"])
+    rule = dataclasses.replace(DAG, scarce=True)
+    rng = np.random.default_rng([seed, seed_of_suite(env.name, "dag")])
+    trees = draw_suite(rng, rule, env.num_propositions, np.zeros(0, np.uint32), where)
+    suite = suite_from_trees("dag", trees, env.propositions)
+    formulas = [suite.formulas[row] for row in range(len(suite)) if _possible(env, suite.take([row]))]
+    if not formulas:
+        raise ValueError(f"{env.name}: none of {len(suite)} random tasks can be satisfied within {env.horizon} steps")
+    about = f"{rule.about}; fewer of a depth where there are few"
+    return commented([f"{where}: {len(formulas)} unseen tasks, drawn with seed {seed}", about], formulas)
+
+
+def _possible(env: Environment, task: Suite) -> bool:
+    """Whether there are layouts enough to evaluate on, as far as that is known."""
+    try:
+        make_cases(env, task)
+    except ValueError:
+        return False
+    return True

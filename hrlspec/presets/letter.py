@@ -7,6 +7,16 @@ import functools
 import envs_jax
 from hrlspec.presets.preset import Preset
 from hrlspec.presets.recipes import Recipe, Settings
+from hrlspec.presets.suite_rules import (
+    DAG,
+    NUM_TASKS,
+    SuiteRule,
+    always_avoids,
+    root_children,
+    sequences,
+    shortest,
+    trees,
+)
 from hrlspec.tasks.rewards import Bonus
 
 # The paper gives none for twelve letters; these serve there too.
@@ -26,13 +36,54 @@ def _twelve(settings: Settings, recipe: Recipe) -> Settings:
     return settings.evolve({"config.total_steps": 6_000_000})
 
 
+_SUITES = {
+    "dag": DAG,
+    "deeper": SuiteRule(
+        "random trees of depth 5, beyond what training collects on or relabels to, 1 to 3 children of a node, "
+        "0 to 2 negatives on an edge; every way to satisfy a task takes 5 sub-tasks",
+        (trees(5, num_drawn=60 * NUM_TASKS),),
+        lambda tasks: shortest(tasks) == 5,
+    ),
+    "wider": SuiteRule(
+        "random trees, depth 2, 3 and 4 in equal numbers, 4 children of the root, beyond what training collects on "
+        "or relabels to, 1 to 4 elsewhere, 0 to 2 negatives on an edge; every way to satisfy a task takes 2 "
+        "sub-tasks or more",
+        tuple(trees(depth, max_branching=4, num_drawn=30 * NUM_TASKS) for depth in (2, 3, 4)),
+        lambda tasks: (root_children(tasks) == 4) & (shortest(tasks) >= 2),
+    ),
+    "branches": SuiteRule(
+        "random trees, depth 2, 3 and 4 in equal numbers, 2 or 3 children of the root, 1 to 3 elsewhere, 0 to 2 "
+        "negatives on an edge; for return over optimum, where branches may be of any length",
+        tuple(trees(depth) for depth in (2, 3, 4)),
+        lambda tasks: root_children(tasks) >= 2,
+    ),
+}
+_SUITES12 = {
+    "dag": DAG,
+    "reach_avoid_6": SuiteRule(
+        "sequences of 6 sub-tasks, 1 or 2 negatives on each (the peers' RA-6)",
+        (sequences(6, max_avoid=2, num_drawn=40 * NUM_TASKS),),
+        always_avoids,
+    ),
+    "reach_12": SuiteRule(
+        "sequences of 12 sub-tasks without negatives (the peers' R-12)",
+        (sequences(12, max_avoid=0, num_drawn=2 * NUM_TASKS),),
+    ),
+}
+
 LETTER = Preset(
     "letter",
     functools.partial(envs_jax.make, "letter"),
     bonuses=_BONUSES,
     learning_rates=_LEARNING_RATES,
+    suites=_SUITES,
     quick_compile=True,
 )
 LETTER12 = Preset(
-    "letter12", functools.partial(envs_jax.make, "letter12"), _twelve, bonuses=_BONUSES, quick_compile=True
+    "letter12",
+    functools.partial(envs_jax.make, "letter12"),
+    _twelve,
+    bonuses=_BONUSES,
+    suites=_SUITES12,
+    quick_compile=True,
 )

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
+
+import numpy as np
 
 from envs_jax import Environment
 from hrlspec.agent.method import Method
 from hrlspec.config import Config, evolve
+from hrlspec.evaluation import Suite, suite_from_text
 from hrlspec.methods import METHODS, ImplicitPlanner
 from hrlspec.presets.recipes import Recipe, RewardSet, Settings, recipe, with_bonuses
+from hrlspec.presets.suite_rules import SuiteRule
+from hrlspec.presets.suites import SuiteError, hashes_of, packaged_hashes, packaged_suite
 from hrlspec.tasks.rewards import Bonus, RewardMachine, reward_machine
 
 Fit = Callable[[Settings, Recipe], Settings]
@@ -33,6 +39,8 @@ class Preset:
         learning_rates: where a method's tuning chose another one than its recipe's, by recipe and method: the trial
             with the largest sum of the learning curve's mean and the final return (``reproduce --only walk-tuning`` and
             its like).
+        suites: test suites by name, and how those in the files of this package were drawn.
+        texts: the test suites by name, one formula a line, where they are not in those files.
         quick_compile: whether programs run as fast when XLA spends little time on them; true where matrix products
             are most of the arithmetic, which are not compiled.
     """
@@ -43,6 +51,8 @@ class Preset:
     fit_bonuses: Fit = _as_it_is
     bonuses: tuple[Bonus, ...] = ()
     learning_rates: Mapping[tuple[Recipe, str], float] = dataclasses.field(default_factory=dict)
+    suites: Mapping[str, SuiteRule] = dataclasses.field(default_factory=dict)
+    texts: Mapping[str, str] = dataclasses.field(default_factory=dict)
     quick_compile: bool = False
 
     def settings(
@@ -76,6 +86,39 @@ class Preset:
         if reward_set == 1:
             return reward_machine(propositions)
         return reward_machine(propositions, subtask=1.0, bonuses=self.bonuses)
+
+    @property
+    def suite_names(self) -> tuple[str, ...]:
+        """The test suites; none for a world that nobody drew any for."""
+        return (*self.suites, *self.texts)
+
+    def suite(self, name: str) -> Suite:
+        """A test suite by its name.
+
+        Raises:
+            SuiteError: there is none, or its file cannot be read.
+        """
+        propositions = self.make().propositions
+        if name in self.texts:
+            return suite_from_text(name, self.texts[name], propositions)
+        if name not in self.suites:
+            known = f"expected one of: {', '.join(self.suite_names)}" if self.suite_names else "there is none for it"
+            raise SuiteError(f"unknown suite {name!r} of {self.name!r}; {known}")
+        return packaged_suite(self.name, name, propositions)
+
+    @functools.cached_property
+    def reserved(self) -> np.ndarray:
+        """Sorted hashes of the tasks of all suites, uint32 ``[...]``: training must not see them.
+
+        Tasks of one sub-task are not among them: where there are such, everything else is made of them.
+
+        Raises:
+            SuiteError: a suite's file cannot be read.
+        """
+        if self.suites:
+            return packaged_hashes(self.name, tuple(self.suites), self.make().propositions)
+        suites = [self.suite(name) for name in self.texts]
+        return hashes_of([suite.take(np.flatnonzero(suite.depths > 1)) for suite in suites])
 
 
 def named_method(name: str) -> Method:

@@ -7,6 +7,7 @@ import functools
 import envs_jax
 from hrlspec.presets.preset import Preset
 from hrlspec.presets.recipes import Recipe, Settings, continuous
+from hrlspec.presets.suite_rules import DAG, REACH, REACH_AVOID
 from hrlspec.tasks.rewards import Bonus
 
 
@@ -51,6 +52,8 @@ def walk_with_bonuses(settings: Settings, recipe: Recipe) -> Settings:
     )
 
 
+_SUITES = {"dag": DAG, "reach_avoid": REACH_AVOID, "reach": REACH}
+
 WALK = Preset(
     "walk",
     functools.partial(envs_jax.make, "walk"),
@@ -58,6 +61,7 @@ WALK = Preset(
     walk_with_bonuses,
     bonuses=(Bonus("d", "b", 5.0, ("e",)), Bonus("b", "c", 10.0, ("a",))),
     learning_rates={("paper", "ltl2action"): 2e-3, ("paper", "option"): 2e-3, ("hrlspec", "option"): 2e-3},
+    suites=_SUITES,
     quick_compile=True,
 )
-FLATWORLD = Preset("flatworld", functools.partial(envs_jax.make, "flatworld"), walk, quick_compile=True)
+FLATWORLD = Preset("flatworld", functools.partial(envs_jax.make, "flatworld"), walk, suites=_SUITES, quick_compile=True)

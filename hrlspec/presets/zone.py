@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+from collections.abc import Mapping
+
+import numpy as np
 
 import envs_jax
+from envs_jax.zone.layouts import COLOURS
 from hrlspec.presets.preset import Preset
 from hrlspec.presets.recipes import Recipe, Settings, continuous
+from hrlspec.presets.suite_rules import NUM_TASKS, REACH, REACH_AVOID, SuiteRule, random_trees, shortest, trees
+from hrlspec.spec import TaskTree
 from hrlspec.tasks.rewards import Bonus
 
 
@@ -61,7 +68,46 @@ _LEARNING_RATES: dict[tuple[Recipe, str], float] = {
 }
 
 
-def _preset(name: str) -> Preset:
+_BLUE, _GREEN = (COLOURS.index(colour) for colour in ("blue", "green"))
+
+
+def _ways(tasks: TaskTree, first: int, second: int) -> tuple[np.ndarray, np.ndarray]:
+    """How many ways to satisfy each task there are, and how many reach ``second`` after ``first``; int ``[M]``."""
+    parent, reach = np.asarray(tasks.parent), np.asarray(tasks.reach)
+    rows = np.arange(len(parent))
+    met, spoilt = np.zeros(parent.shape, bool), np.zeros(parent.shape, bool)
+    for node in range(1, parent.shape[1]):  # parents come before children
+        above = parent[:, node]
+        spoilt[:, node] = spoilt[rows, above] | (met[rows, above] & reach[:, node, second])
+        met[:, node] = met[rows, above] | reach[:, node, first]
+    ends = np.asarray(tasks.accepting & tasks.valid)
+    return ends.sum(-1), (ends & spoilt).sum(-1)
+
+
+def _possible(tasks: TaskTree) -> np.ndarray:
+    """Whether some way to satisfy the task leaves green before blue makes it vanish, bool ``[M]``."""
+    ways, spoilt = _ways(tasks, _BLUE, _GREEN)
+    return (shortest(tasks) >= 2) & (spoilt < ways)
+
+
+def _order_matters(tasks: TaskTree) -> np.ndarray:
+    """Whether besides that some other way asks for green after blue, bool ``[M]``."""
+    return _possible(tasks) & (_ways(tasks, _BLUE, _GREEN)[1] > 0)
+
+
+_DAG = random_trees(2, 3)
+_NM_DAG = dataclasses.replace(
+    _DAG, about=f"{_DAG.about}, and at least one way asks for no green after blue", keep=_possible
+)
+_NM_ORDER = dataclasses.replace(
+    _DAG,
+    about=f"{_NM_DAG.about}, but some other way does, where no green is left",
+    draws=tuple(trees(depth, num_drawn=16 * NUM_TASKS) for depth in (2, 3)),
+    keep=_order_matters,
+)
+
+
+def _preset(name: str, suites: Mapping[str, SuiteRule]) -> Preset:
     return Preset(
         name,
         functools.partial(envs_jax.make, name),
@@ -69,9 +115,10 @@ def _preset(name: str) -> Preset:
         zone_with_bonuses,
         bonuses=_BONUSES,
         learning_rates=_LEARNING_RATES,
+        suites=suites,
     )
 
 
-ZONE = _preset("zone")
-ZONE_LTL2ACTION = _preset("zone-ltl2action")
-ZONE_NM = _preset("zone-nm")
+ZONE = _preset("zone", {"dag": _DAG, "reach_avoid": REACH_AVOID, "reach": REACH})
+ZONE_LTL2ACTION = _preset("zone-ltl2action", {"dag": _DAG})
+ZONE_NM = _preset("zone-nm", {"dag": _NM_DAG, "order": _NM_ORDER})

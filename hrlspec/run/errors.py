@@ -14,6 +14,7 @@ from collections.abc import Callable
 from types import FrameType
 
 from hrlspec.checkpoint import CheckpointError
+from hrlspec.presets.suites import SuiteError
 from hrlspec.spec import SpecError
 
 OK, BAD_INPUT, INTERRUPTED = 0, 2, 130
@@ -30,8 +31,9 @@ class Interrupted(Exception):
 def main_guard(main: Callable[[], None]) -> int:
     """Runs a command line and returns its exit status: ``sys.exit(main_guard(main))``.
 
-    `UserError`, `SpecError` and `CheckpointError` become one line on standard error and status 2. `Interrupted`,
-    Ctrl-C and SIGTERM become status 130. ``SystemExit``, which the parser of flags raises, passes through.
+    `UserError`, `SpecError`, `SuiteError` and `CheckpointError` become one line on standard error and status 2.
+    `Interrupted`, Ctrl-C and SIGTERM become status 130. ``SystemExit``, which the parser of flags raises, passes
+    through.
     """
     # Without this SIGTERM would end the process on the spot: no lock released in order, no status of its own.
     in_main_thread = threading.current_thread() is threading.main_thread()
@@ -39,7 +41,7 @@ def main_guard(main: Callable[[], None]) -> int:
     try:
         main()
         sys.stdout.flush()
-    except (UserError, SpecError, CheckpointError) as error:
+    except (UserError, SpecError, SuiteError, CheckpointError) as error:
         return _say(f"error: {error}", BAD_INPUT)
     except Interrupted as stop:
         return _say(f"interrupted: {stop}", INTERRUPTED)

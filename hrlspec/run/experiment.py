@@ -73,6 +73,11 @@ class Experiment:
         return parts.replace(":", ".")
 
     @property
+    def is_foreign(self) -> bool:
+        """Whether its environment or its method is not of this library."""
+        return ":" in self.env + self.method
+
+    @property
     def preset(self) -> Preset:
         """The environment with what belongs to it."""
         return preset_named(self.env)

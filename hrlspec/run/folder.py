@@ -7,6 +7,7 @@
     checkpoints/     see hrlspec.checkpoint.store
     tensorboard/     event files with the same numbers as metrics.jsonl
     plots/           pictures
+    tasks/           test tasks, where the environment has no suites of its own
     summary.json     the final results
 
 A row of metrics is written before the checkpoint of its step. So after a kill at any moment the rows up to the newest
@@ -118,6 +119,12 @@ class RunFolder:
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """Writes ``summary.json``, replacing an earlier one as a whole."""
         _write_atomically(self.path / "summary.json", json.dumps(_plain(summary), indent=2, allow_nan=False) + "\n")
+
+    def write_tasks(self, name: str, text: str) -> None:
+        """Writes a test suite."""
+        folder = self.path / "tasks"
+        folder.mkdir(exist_ok=True)
+        _write_atomically(folder / f"{name}.txt", text)
 
     def _begin(self, env_steps: int) -> None:
         """Accepts rows from ``env_steps`` on; TensorBoard is told to forget what an earlier process wrote after it."""
@@ -361,7 +368,7 @@ def _commit() -> str | None:
 def _write_atomically(file: Path, text: str) -> None:
     """Replaces a file so that no reader and no kill ever meets half of it."""
     temporary = file.with_name(f".{file.name}.new")
-    with temporary.open("w") as stream:
+    with temporary.open("w", encoding="utf-8") as stream:
         stream.write(text)
         stream.flush()
         os.fsync(stream.fileno())

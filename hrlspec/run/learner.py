@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -25,14 +26,14 @@ from hrlspec.evaluation import (
 )
 from hrlspec.exact.contested import Contestable
 from hrlspec.learning.train import Trainer, TrainState
-from hrlspec.presets.suites import load_suite, reserved_hashes, suite_names
+from hrlspec.presets import Preset
 from hrlspec.run.errors import UserError
 from hrlspec.run.experiment import Experiment
 from hrlspec.run.loop import Job
 from hrlspec.run.programs import Program
 from hrlspec.tasks.bank import TaskBanks
 
-PERIODIC_TASKS = 10
+PERIODIC_TASKS = (1, 2, 5, 10)  # the most there are; each divides the number of episodes
 _EVALUATION_STREAM, _FINAL_STREAM = 1, 2  # of random numbers, apart from training's
 
 
@@ -62,22 +63,27 @@ class FinalResults:
 class Learner:
     """An experiment with everything it needs: environment, agent, rewards, held-out tasks.
 
+    Args:
+        experiment: what to learn.
+        preset: its environment's, with test suites.
+
     Raises:
         UserError: no training task can be drawn under the experiment's configuration.
     """
 
-    def __init__(self, experiment: Experiment) -> None:
-        self.experiment = experiment
+    def __init__(self, experiment: Experiment, preset: Preset) -> None:
+        self.experiment, self.preset = experiment, preset
         self.agent = experiment.agent
         self.env = self.agent.env
         self.trainer = Trainer(self.agent)
-        self._init_program = Program("init", Trainer.init, self.trainer)
-        self._iterate_program = Program("iterate", Trainer.iterate, self.trainer)
+        self._init_program = self._program("init", Trainer.init)
+        self._iterate_program = self._program("iterate", Trainer.iterate)
         self.machine = experiment.rewards
-        reserved = reserved_hashes(experiment.env)
-        self._reserved = jnp.asarray(reserved)
+        self._reserved = jnp.asarray(preset.reserved)
         try:
-            self._banks = TaskBanks(experiment.seed, experiment.config.curriculum, self.env.num_propositions, reserved)
+            self._banks = TaskBanks(
+                experiment.seed, experiment.config.curriculum, self.env.num_propositions, preset.reserved
+            )
         except ValueError as error:
             raise UserError(f"no training tasks with this --config.curriculum: {error}") from error
 
@@ -103,10 +109,12 @@ class Learner:
         result = final_evaluation(self.env, suite, episodes=len(suite), greedy=settings.greedy)(keys[0], *how)
         choice = returns = None
         if settings.contested and isinstance(self.env, Contestable):
-            evaluation = choice_evaluation(self.env, num_cases=settings.contested, greedy=settings.greedy)
-            choice = evaluation(keys[1], *how)
-        if self.experiment.reward_set == 2 and "branches" in suite_names(self.experiment.env):
-            branches = load_suite(self.experiment.env, "branches")
+            # An environment of somebody else's may be of that kind and yet have hardly any such layout.
+            with contextlib.suppress(ValueError):
+                evaluation = choice_evaluation(self.env, num_cases=settings.contested, greedy=settings.greedy)
+                choice = evaluation(keys[1], *how)
+        if self.experiment.reward_set == 2 and "branches" in self.preset.suite_names:
+            branches = self.preset.suite("branches")
             branches = branches.take(_spread(len(branches), settings.final_tasks))
             returns = return_evaluation(self.env, branches, self.machine, greedy=settings.greedy)(keys[2], *how)
         return FinalResults(result, choice, returns)
@@ -114,14 +122,21 @@ class Learner:
     @functools.cached_property
     def test_suite(self) -> Suite:
         """Unseen tasks."""
-        return load_suite(self.experiment.env, "dag")
+        return self.preset.suite("dag")
 
     @functools.cached_property
     def _periodic(self) -> SuiteEvaluation:
-        settings = self.experiment.evaluation
+        settings, suite = self.experiment.evaluation, self.test_suite
+        num_tasks = max(number for number in PERIODIC_TASKS if number <= len(suite))
         return periodic_evaluation(
-            self.env, self.test_suite, num_tasks=PERIODIC_TASKS, episodes=settings.episodes, greedy=settings.greedy
+            self.env, suite, num_tasks=num_tasks, episodes=settings.episodes, greedy=settings.greedy
         )
+
+    def _program(self, name: str, function: Any) -> Callable[..., Any]:
+        """A function of the trainer; kept from run to run unless it is made of code that others may change."""
+        if self.experiment.is_foreign:
+            return functools.partial(function, self.trainer)
+        return Program(name, function, self.trainer)
 
     def _init(self) -> TrainState:
         key = jax.random.key(self.experiment.seed)

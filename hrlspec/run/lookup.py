@@ -12,6 +12,7 @@ from envs_jax import Environment
 from hrlspec.methods import METHODS, Method
 from hrlspec.presets import PRESETS, Preset, preset, preset_for
 from hrlspec.run.errors import UserError
+from hrlspec.spec import SpecError, parse
 
 T = TypeVar("T")
 
@@ -25,7 +26,13 @@ def preset_named(name: str) -> Preset:
     """
     if ":" in name:
         expected = "an environment that keeps the contract in envs_jax/base.py"
-        return preset_for(_load(name, Environment, expected))  # type: ignore[type-abstract]
+        env = _load(name, Environment, expected)  # type: ignore[type-abstract]
+        for proposition in env.propositions:
+            try:
+                parse(f"achieve {proposition}")
+            except SpecError as error:
+                raise UserError(f"{name}: tasks cannot name the proposition {proposition!r}: {error}") from None
+        return preset_for(env)
     if name not in PRESETS:
         raise UserError(f"unknown environment {name!r}, expected one of {', '.join(PRESETS)}, or module:factory")
     return preset(name)
@@ -45,6 +52,12 @@ def method_named(name: str) -> Method:
     return METHODS[name]
 
 
+def search_here() -> None:
+    """Lets modules in the current directory be imported, as ``python -m`` does and console scripts do not."""
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+
+
 def _load(name: str, kind: type[T], expected: str) -> T:
     """The value at ``module:attribute``, or what it returns when called. The current directory is searched first.
 
@@ -52,8 +65,7 @@ def _load(name: str, kind: type[T], expected: str) -> T:
         UserError: it cannot be had, or is of another kind, or cannot be hashed, as static arguments must be.
     """
     module_name, _, attribute = name.partition(":")
-    if os.getcwd() not in sys.path:  # console scripts do not have it there
-        sys.path.insert(0, os.getcwd())
+    search_here()
     try:
         found = importlib.import_module(module_name)
         for part in attribute.split("."):

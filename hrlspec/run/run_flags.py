@@ -19,6 +19,7 @@ from hrlspec.run.experiment import EvaluationConfig, Experiment
 from hrlspec.run.flags import in_flags, parse_flags
 from hrlspec.run.lookup import method_named, preset_named
 
+_FIRST = next(iter(PRESETS))
 _LAST_SEED = 2**31 - 1
 
 
@@ -30,7 +31,7 @@ class RunFlags(Checked):
     them.
     """
 
-    env: str = "letter"
+    env: str = _FIRST
     """A name from above, or module:factory."""
     method: str = "ours"
     """A name from above, or module:VALUE."""

@@ -1,4 +1,4 @@
-"""``python -m experiments.demo rooms|dilemma``: the paper's two motivating examples, trained on and drawn.
+"""``hrlspec demo rooms|dilemma``: the paper's two motivating examples, trained on and drawn.
 
 ``rooms``: red ball, then blue ball, behind a door whose key lies at the start. Who thinks of one sub-task at a time
 comes back for the key. ``dilemma``: reaching a completes the task, and closes off c, which pays ten times as much.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -38,7 +37,6 @@ from hrlspec.spec import TaskTree
 from hrlspec.tasks.bank import TaskBanks
 from hrlspec.tasks.rewards import Bonus, RewardMachine, reward_machine
 
-PROGRAM = "python -m experiments.demo"
 LAYOUTS = 200
 """Episodes behind each figure of the table."""
 
@@ -96,16 +94,17 @@ class Demo:
         return Agent(self.env, evolve(config, {"total_steps": steps}), method)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+def main(argv: Sequence[str], *, program: str = "hrlspec demo") -> None:
     """The command line.
 
     Args:
-        argv: the arguments, those of the process by default.
+        argv: the arguments.
+        program: what to call it in messages.
 
     Raises:
         UserError: bad usage.
     """
-    flags = parse_flags(DemoFlags, sys.argv[1:] if argv is None else argv, program=PROGRAM)
+    flags = parse_flags(DemoFlags, argv, program=program)
     demo = DEMOS[flags.world]
     steps = demo.steps if flags.steps is None else flags.steps
     if steps < 1:

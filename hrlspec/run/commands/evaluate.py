@@ -1,4 +1,4 @@
-"""Evaluates a trained agent: ``python -m experiments.evaluate --run DIR``, with ``--help`` for the flags.
+"""Evaluates a trained agent: ``hrlspec evaluate --run DIR``, with ``--help`` for the flags.
 
 Exit status: 0 done, 2 bad usage or input.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,15 +19,14 @@ from hrlspec.agent.agent import Agent
 from hrlspec.agent.low_level import Params
 from hrlspec.evaluation import Suite, evaluate_suite, suite_from_text
 from hrlspec.evaluation.suite import MAX_NODES
-from hrlspec.presets.suites import load_suite
 from hrlspec.run import platform
 from hrlspec.run.errors import UserError
 from hrlspec.run.experiment import Experiment, experiment_of
 from hrlspec.run.flags import parse_flags
 from hrlspec.run.folder import read_record
 from hrlspec.run.tables import result_console, suite_table
+from hrlspec.run.unseen import with_tasks
 
-PROGRAM = "python -m experiments.evaluate"
 MOST_PICTURES = 9
 _LARGEST_FILE = 1_000_000  # bytes
 
@@ -66,18 +64,19 @@ class EvaluateFlags:
     """Print one JSON object and nothing else on standard output."""
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+def main(argv: Sequence[str], *, program: str = "hrlspec evaluate") -> None:
     """The command line.
 
     Args:
-        argv: the arguments, those of the process by default.
+        argv: the arguments.
+        program: what to call it in messages.
 
     Raises:
         UserError: bad usage or input.
         SpecError: a task cannot be read.
         CheckpointError: there is no usable checkpoint.
     """
-    flags = parse_flags(EvaluateFlags, sys.argv[1:] if argv is None else argv, program=PROGRAM)
+    flags = parse_flags(EvaluateFlags, argv, program=program)
     _check(flags)
     experiment = experiment_of(read_record(flags.run)["config"], str(flags.run))
     suite = tasks_of(flags, experiment)
@@ -143,7 +142,7 @@ def tasks_of(flags: EvaluateFlags, experiment: Experiment) -> Suite:
         SpecError: a task cannot be read or is too large.
     """
     if flags.suite is not None:
-        return load_suite(experiment.env, flags.suite)
+        return with_tasks(experiment.preset, flags.run, experiment.seed).suite(flags.suite)
     if flags.spec is not None:
         # A task may be written over several lines; a suite has one on each.
         name, text = "--spec", " ".join(line.split("#", 1)[0] for line in flags.spec.splitlines())

@@ -1,4 +1,4 @@
-"""Trains an agent: ``python -m experiments.run``, with ``--help`` for the flags.
+"""Trains an agent: ``hrlspec run``, with ``--help`` for the flags.
 
 The run folder is described in ``hrlspec/run/folder.py``. Exit status: 0 done, 1 training diverged, 2 bad usage or
 input, 130 interrupted with a checkpoint written.
@@ -6,7 +6,6 @@ input, 130 interrupted with a checkpoint written.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -24,20 +23,22 @@ from hrlspec.run.loop import DivergedError, Loop
 from hrlspec.run.progress import ProgressDisplay, duration
 from hrlspec.run.run_flags import RunFlags, experiments_of, parse_run
 from hrlspec.run.tables import aggregate_table, final_tables, result_console
+from hrlspec.run.unseen import with_tasks
 
 
-def main(argv: Sequence[str] | None = None) -> None:
+def main(argv: Sequence[str], *, program: str = "hrlspec run") -> None:
     """The command line.
 
     Args:
-        argv: the arguments, those of the process by default.
+        argv: the arguments.
+        program: what to call it in messages.
 
     Raises:
         UserError: bad usage or input; nothing was written.
         Interrupted: stopped by a signal; a checkpoint was written.
         SystemExit: with a message, when training diverged.
     """
-    flags = parse_run(sys.argv[1:] if argv is None else argv)
+    flags = parse_run(argv, program=program)
     runs = experiments_of(flags)
     resumed = _check_folders(runs, flags)
     platform.prepare(flags.env, flags.recipe)
@@ -75,8 +76,11 @@ def _run(experiment: Experiment, folder: Path, resume: bool, flags: RunFlags, co
     if summary is not None:
         console.print(f"{folder} is finished; its results are in summary.json", highlight=False, soft_wrap=True)
         return summary
-    learner = Learner(experiment)
+    preset = with_tasks(experiment.preset, folder, experiment.seed)
+    learner = Learner(experiment, preset)
     with open_run(folder, experiment, resume=resume) as run:
+        for name, text in preset.texts.items():
+            run.write_tasks(name, text)
         job = learner.job()
         total = job.num_iterations * job.steps_per_iteration
         with ProgressDisplay(total, experiment.name) as display:

@@ -1,0 +1,72 @@
+"""The console command ``hrlspec``: one sub-command for each module of ``experiments/``."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Sequence
+
+from hrlspec.run.checkout import check_checkout
+from hrlspec.run.errors import UserError, main_guard
+from hrlspec.run.lookup import search_here
+from hrlspec.version import __version__
+
+COMMANDS = {
+    "run": "train an agent, evaluate it on unseen tasks, draw what it does",
+    "evaluate": "evaluate a trained agent on tasks of your own, or draw it",
+    "demo": "the paper's two motivating examples, trained and drawn",
+    "reproduce": "the paper's figures, in a checkout of the project",
+    "suites": "draw the test suites anew, or check them",
+}
+_IN_CHECKOUT = ("reproduce",)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command ``hrlspec``; returns its exit status.
+
+    Args:
+        argv: the arguments, those of the process by default.
+    """
+    name, *rest = (sys.argv[1:] if argv is None else argv) or [""]
+    if name in ("-h", "--help"):
+        print("usage: hrlspec COMMAND [OPTIONS]\n")
+        print("Zero-shot reinforcement learning from logical specifications.\n\ncommands:")
+        print("\n".join(f"  {command:<10} {about}" for command, about in COMMANDS.items()))
+        print("\nhrlspec COMMAND --help shows the options; hrlspec --version the version.")
+        return 0
+    if name == "--version":
+        print(f"hrlspec {__version__}")
+        return 0
+    return call(name, rest, program=f"hrlspec {name}")
+
+
+def call(name: str, argv: Sequence[str] | None = None, *, program: str) -> int:
+    """Runs a command and returns its exit status; see `main_guard`.
+
+    Args:
+        name: one of `COMMANDS`.
+        argv: the command's arguments, those of the process by default.
+        program: what the user called, for messages.
+    """
+    return main_guard(lambda: _command(name)(sys.argv[1:] if argv is None else argv, program=program))
+
+
+def _command(name: str) -> Callable[..., None]:
+    """The command's main function.
+
+    Raises:
+        UserError: there is none, or it cannot run here.
+    """
+    if name not in COMMANDS:
+        raise UserError(f"expected a command, one of {', '.join(COMMANDS)}, found {name!r} (see hrlspec --help)")
+    if name in _IN_CHECKOUT:
+        check_checkout(name)
+        search_here()
+    package = "experiments" if name in _IN_CHECKOUT else "hrlspec.run.commands"
+    try:
+        command: Callable[..., None] = importlib.import_module(f"{package}.{name}").main
+    except ModuleNotFoundError as error:
+        if error.name not in ("tyro", "rich"):
+            raise
+        raise UserError('the commands need the extra "cli": pip install "hrlspec[cli]"') from error
+    return command
