@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool
 
 from hrlspec.spec.conditions import Vocabulary, forbidden, goals
 from hrlspec.spec.graph import Graphs
@@ -36,8 +37,8 @@ def compile_task(formula: Formula, propositions: Sequence[str], max_nodes: int) 
     """The task tree of a formula, padded to N nodes; children stand in the order of the text.
 
     Edges of one node with the same reach and avoid sets are one edge. An accepting node has no children: the task
-    is satisfied on arrival. A sub-task that forbids what it reaches can never be done: such alternatives are left
-    out with a warning, and refused where nothing else remains. A tree deeper than the planner's look-ahead is
+    is satisfied on arrival. A sub-task that avoids what it reaches is unsatisfiable: such alternatives are left out
+    with a warning, and refused where no other remains. A tree deeper than the planner's look-ahead is
     allowed; the look-ahead then ends at that depth.
 
     Args:
@@ -54,7 +55,7 @@ def compile_task(formula: Formula, propositions: Sequence[str], max_nodes: int) 
         ValueError: if ``max_nodes`` is out of range.
 
     Warns:
-        SpecWarning: where an edge shadows another ({a} beside {a, b}) or an alternative can never be done.
+        SpecWarning: where an edge shadows another ({a} beside {a, b}) or an alternative is unsatisfiable.
     """
     if not 2 <= max_nodes <= MAX_NODES:
         raise ValueError(f"max_nodes must be in 2..{MAX_NODES}, found {max_nodes}")
@@ -74,7 +75,7 @@ def compile_task(formula: Formula, propositions: Sequence[str], max_nodes: int) 
 
 
 class _Builder:
-    """Abstract graphs of a formula's parts, and what the author should be warned of."""
+    """Builds the abstract graphs of a formula's parts and collects warnings."""
 
     def __init__(self, propositions: Sequence[str]) -> None:
         self.vocabulary = Vocabulary(propositions)
@@ -83,14 +84,14 @@ class _Builder:
         self.notes: list[SpecError] = []
 
     def whole(self, formula: Formula) -> int:
-        """The graph of the whole formula, where accepting ends the task."""
+        """The graph of the whole formula; an accepting node ends the task."""
         try:
             return self.graphs.prune(self.build(formula))
         except TooLarge as error:
             raise formula.error(str(error)) from None
 
     def build(self, formula: Formula) -> int:
-        """The graph of a part; where it accepts it may also go on."""
+        """The graph of a part; its accepting nodes may have edges."""
         match formula:
             case Achieve(goal=goal):
                 alternatives = goals(goal, self.vocabulary, self.budget)
@@ -109,7 +110,7 @@ class _Builder:
                 raise TypeError(type(formula).__name__)
 
     def ensure(self, formula: Ensuring, task: int, avoid: int) -> int:
-        """``ensuring`` on every edge; says so where that leaves alternatives, or everything, undoable."""
+        """``ensuring`` on every edge; warns where alternatives become unsatisfiable, raises where all of them do."""
         result = self.graphs.ensure(task, avoid)
         if result == self.graphs.DEAD:
             raise formula.error("this task can never be done: 'ensuring' forbids what it has to reach")
@@ -137,7 +138,7 @@ def _unfold(root: int, graphs: Graphs, num_propositions: int, max_nodes: int) ->
     depth = np.zeros(max_nodes, np.int32)
     place = np.arange(num_propositions)
 
-    def members(bits: int) -> np.ndarray:
+    def members(bits: int) -> Bool[np.ndarray, " P"]:
         return np.array([bits >> int(p) & 1 for p in place], bool)
 
     order = [root]

@@ -1,4 +1,4 @@
-"""What the conditions of ``achieve`` and ``ensuring`` mean for the edges of a task graph.
+"""Conditions of ``achieve`` and ``ensuring`` as reach and avoid sets of the edges of a task graph.
 
 ``achieve`` takes a conjunction of propositions, and a disjunction of those becomes parallel edges; ``ensuring``
 takes a conjunction of negated propositions. Negations are pushed inwards by De Morgan first. Anything else is
@@ -77,7 +77,7 @@ def goals(condition: Condition, vocabulary: Vocabulary, budget: Budget, negated:
 
 
 def _minimal(sets: list[int], condition: Condition, budget: Budget) -> list[int]:
-    """Without duplicates and without sets that contain another: a or (a and b) is a."""
+    """The minimal sets, each once: a or (a and b) is a."""
     distinct = list(dict.fromkeys(sets))
     kept: list[int] = []
     for members in sorted(distinct, key=int.bit_count):
@@ -91,7 +91,7 @@ def _minimal(sets: list[int], condition: Condition, budget: Budget) -> list[int]
 
 
 def forbidden(condition: Condition, vocabulary: Vocabulary, negated: bool = False) -> int:
-    """What an ``ensuring`` forbids, as one set.
+    """The set of propositions that an ``ensuring`` forbids.
 
     Raises:
         SpecError: for a proposition that would have to hold, a disjunction, or an unknown proposition.

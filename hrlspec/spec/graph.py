@@ -1,8 +1,8 @@
-"""Abstract graphs (paper, "Task Specification Language"), shared as far as their nodes agree.
+"""Abstract graphs (paper, "Task Specification Language") in which equal nodes are shared.
 
-A node stands for what remains to be done: whether that is nothing (it accepts) and which edges lead on. Nodes are
-interned, so equal remainders are one node, and every operation is remembered. That keeps the graph of a formula
-small where its tree is exponentially large; the tree's size is counted on the graph before anything is unfolded.
+A node represents the remaining task: whether it accepts, and its outgoing edges. Nodes are interned, so equal
+remaining tasks are one node, and operations are memoised. That keeps the graph of a formula small where its tree is
+exponentially large; the tree's size is counted on the graph before anything is unfolded.
 
 Sets of propositions are integers, bit p standing for proposition p.
 """
@@ -17,7 +17,7 @@ from hrlspec.spec.syntax import Budget, TooLarge
 MAX_STEPS = 128
 
 Edge = tuple[int, int]
-"""What an edge reaches and what it avoids."""
+"""The reach set and the avoid set of an edge."""
 
 
 class Graphs:
@@ -59,7 +59,7 @@ class Graphs:
         return self._index[key]
 
     def union(self, nodes: Iterable[int]) -> int:
-        """Either of these. Edges with the same reach and avoid become one (left factoring)."""
+        """Choice between nodes. Edges with the same reach and avoid sets are merged (left factoring)."""
         distinct = tuple(dict.fromkeys(node for node in nodes if node != self.DEAD))
         if len(distinct) < 2:
             return distinct[0] if distinct else self.DEAD
@@ -76,7 +76,7 @@ class Graphs:
         return self._unions[distinct]
 
     def append(self, first: int, then: int) -> int:
-        """``then`` begins wherever ``first`` accepts, also where ``first`` itself could go on."""
+        """Sequential composition: ``then`` starts at every accepting node of ``first``, also at those with edges."""
         if first == self.DONE:
             return then
         if (first, then) not in self._appended:
@@ -88,7 +88,7 @@ class Graphs:
         return self._appended[first, then]
 
     def ensure(self, node: int, avoid: int) -> int:
-        """Every edge also avoids ``avoid``; one that would reach what it avoids can never be taken and goes."""
+        """Adds ``avoid`` to every edge; an edge that reaches what it avoids is unsatisfiable and removed."""
         if (node, avoid) not in self._ensured:
             targets: dict[Edge, list[int]] = {}
             for (reach, own), to in self.edges[node].items():
@@ -101,7 +101,7 @@ class Graphs:
         return self._ensured[node, avoid]
 
     def prune(self, node: int) -> int:
-        """Without what follows an accepting node: the task is satisfied on arrival there."""
+        """Removes what follows an accepting node: the task is satisfied on arrival there."""
         if self.accepting[node]:
             return self.DONE
         if node not in self._pruned:
@@ -112,7 +112,7 @@ class Graphs:
         return self._pruned[node]
 
     def reachable(self, root: int) -> list[int]:
-        """A node and all that its edges lead to, each once."""
+        """All nodes reachable from a node, itself included, each once."""
         order = {root: None}
         pending = [root]
         while pending:

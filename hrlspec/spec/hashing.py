@@ -1,6 +1,6 @@
-"""A number for a task that does not depend on how its tree is written down.
+"""Hashes of tasks, invariant under the order and the padding of their trees' nodes.
 
-Held-out tasks are recognised by it: every sampler, the relabeller included, rejects a task whose hash is
+Held-out tasks are recognised by their hashes: every sampler, the relabeller included, rejects a task whose hash is
 reserved. Two trees with the same hash are the same task up to collisions of 32 bits.
 
 Axes: **M** tasks, **N** tree nodes, **P** atomic propositions.
@@ -8,19 +8,24 @@ Axes: **M** tasks, **N** tree nodes, **P** atomic propositions.
 
 from __future__ import annotations
 
-from typing import Any
+from types import ModuleType
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import UInt32
 
+from envs_jax.arrays import Array
 from hrlspec.spec.tree import TaskTree
+
+A = TypeVar("A", jax.Array, np.ndarray)
 
 _REACH, _AVOID, _ACCEPTING, _LEAF = 0x9E3779B9, 0x7F4A7C15, 0xC2B2AE35, 0x27D4EB2F
 
 
 @jax.jit
-def task_hash(tree: TaskTree) -> jax.Array:
+def task_hash(tree: TaskTree) -> UInt32[Array, ""]:
     """Hash of one task, uint32 ``[]``; ``vmap`` for more.
 
     It depends on the reach and avoid sets of the edges, on which nodes accept and on how the edges follow
@@ -30,7 +35,7 @@ def task_hash(tree: TaskTree) -> jax.Array:
     own = _own_words(tree, jnp)
     index = jnp.arange(tree.num_nodes)
 
-    def absorb(below: jax.Array, node: tuple[jax.Array, ...]) -> tuple[jax.Array, None]:
+    def absorb(below: UInt32[Array, " N"], node: tuple[Array, ...]) -> tuple[UInt32[Array, " N"], None]:
         i, parent, is_edge, word = node
         message = jnp.where(is_edge, _message(word, below[i]), jnp.uint32(0))
         return below + jnp.where(index == parent, message, jnp.uint32(0)), None
@@ -42,7 +47,7 @@ def task_hash(tree: TaskTree) -> jax.Array:
     return _mix(below[TaskTree.ROOT])
 
 
-def task_hashes(trees: TaskTree) -> np.ndarray:
+def task_hashes(trees: TaskTree) -> UInt32[np.ndarray, " M"]:
     """:func:`task_hash` of a stack of tasks on the host, without compiling anything.
 
     Args:
@@ -53,7 +58,7 @@ def task_hashes(trees: TaskTree) -> np.ndarray:
     """
     trees = jax.tree.map(np.asarray, trees)
     edge = trees.valid & (trees.parent >= 0)
-    own = _own_words(trees, np)
+    own = np.asarray(_own_words(trees, np))
     below = np.zeros(edge.shape, np.uint32)
     index = np.arange(edge.shape[-1])
     for i in reversed(range(edge.shape[-1])):
@@ -62,8 +67,8 @@ def task_hashes(trees: TaskTree) -> np.ndarray:
     return _mix(below[:, TaskTree.ROOT])
 
 
-def _own_words(tree: TaskTree, xp: Any) -> Any:
-    """What each edge says by itself, uint32 ``[..., N]``; ``xp`` is ``numpy`` or ``jax.numpy``."""
+def _own_words(tree: TaskTree, xp: ModuleType) -> UInt32[Array, "*lead N"]:
+    """Hash of each edge by itself, uint32 ``[..., N]``; ``xp`` is ``numpy`` or ``jax.numpy``."""
     propositions = np.arange(1, tree.num_propositions + 1, dtype=np.uint32)
     zero = np.uint32(0)
     reach = xp.where(tree.reach, _mix(propositions ^ np.uint32(_REACH)), zero).sum(-1, dtype=np.uint32)
@@ -71,12 +76,12 @@ def _own_words(tree: TaskTree, xp: Any) -> Any:
     return _mix(reach) + avoid + xp.where(tree.accepting, np.uint32(_ACCEPTING), zero)
 
 
-def _message(own: Any, below: Any) -> Any:
-    """What an edge adds to its parent: its own word and, scrambled first, the sum over its children."""
+def _message(own: UInt32[A, "*lead"], below: UInt32[A, "*lead"]) -> UInt32[A, "*lead"]:
+    """What an edge adds to the hash of its parent: its own hash and, mixed first, the sum over its children."""
     return _mix(_mix(below ^ np.uint32(_LEAF)) + own)
 
 
-def _mix(x: Any) -> Any:
+def _mix(x: UInt32[A, "*lead"]) -> UInt32[A, "*lead"]:
     """A bijection of uint32 with full avalanche (xor-shifts and odd multipliers)."""
     x = x ^ (x >> np.uint32(16))
     x = x * np.uint32(0x85EBCA6B)

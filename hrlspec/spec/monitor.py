@@ -20,7 +20,7 @@ VIOLATED = 2
 
 @struct.dataclass
 class TaskState:
-    """Where a task stands: the progression is the subtree at ``node`` without the blocked edges.
+    """Progress of a task: the progression is the subtree at ``node`` without the blocked edges.
 
     Attributes:
         node: int32 ``[]``, the current node.

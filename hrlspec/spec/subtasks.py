@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Bool
 
 from hrlspec.spec.tree import TaskTree, subtask_avoid
 
@@ -44,7 +45,7 @@ def subtasks(tree: TaskTree, node: int, propositions: Sequence[str] | None = Non
         raise ValueError(f"found {len(names)} names, the tree is over {tree.num_propositions} propositions")
     avoid = np.asarray(subtask_avoid(tree))
 
-    def members(row: np.ndarray) -> tuple[str, ...]:
+    def members(row: Bool[np.ndarray, " P"]) -> tuple[str, ...]:
         return tuple(name for name, holds in zip(names, row, strict=True) if holds)
 
     children = np.flatnonzero(tree.valid & (tree.parent == node)).tolist()

@@ -24,7 +24,7 @@ KEYWORDS = frozenset({"achieve", "ensuring", "and", "or", "not"})
 
 
 class SpecError(ValueError):
-    """A specification that is not SPECTRL, says something a task graph cannot, or is too large.
+    """A specification that is not SPECTRL, cannot be expressed as a task graph, or is too large.
 
     Attributes:
         message: what was found and what was expected.
@@ -51,7 +51,7 @@ class TooLarge(Exception):
 
 
 class Budget:
-    """The work that compiling one formula may take, so that no text can make it hang."""
+    """Bounds the work of compiling one formula, so that no text can make it hang."""
 
     def __init__(self) -> None:
         self._left = MAX_WORK
@@ -210,7 +210,7 @@ def check(formula: Formula) -> None:
 
 
 def _parts(node: Node) -> list[tuple[object, type[Node]]]:
-    """The nodes right below ``node`` and what they have to be."""
+    """The children of ``node`` and the type each must have."""
     match node:
         case Achieve(goal=goal):
             return [(goal, Condition)]
