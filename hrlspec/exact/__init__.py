@@ -1,1 +1,1 @@
-"""Exact answers: product automata, dynamic programming, and agents that know the map."""
+"""Exact solutions: product automata, dynamic programming, and reference agents that know the map."""

@@ -1,8 +1,8 @@
-"""A task as an explicit finite automaton: what the exact solver runs beside a finite environment.
+"""A task as an explicit finite automaton, of which the exact solver takes the product with a finite environment.
 
-Its states are those of the monitor (node and blocked edges) together with those of the reward rules; its letters
-are the label sets that occur. It is enumerated in plain Python from the rules the monitor and the rewards follow,
-not from their code, so that each can be tested against the other.
+A state is a state of the monitor (node and blocked edges) with a state of the bonus rules; the alphabet is the set of
+label sets that occur. The automaton is enumerated in plain Python from the definitions of monitor and rewards, not
+from their code, so that each can be tested against the other.
 
 Axes: **M** automaton states, **K** distinct label sets, **B** choices when several edges are met at once,
 **N** tree nodes, **C** children of the root, **P** atomic propositions.
@@ -11,10 +11,11 @@ Axes: **M** automaton states, **K** distinct label sets, **B** choices when seve
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float32, Int32
 
 from hrlspec.spec.tree import TaskTree
 from hrlspec.tasks.rewards import RewardMachine
@@ -22,34 +23,34 @@ from hrlspec.tasks.rewards import RewardMachine
 
 @dataclasses.dataclass(frozen=True)
 class Automaton:
-    """The reachable states of a task and how label sets move them.
+    """The reachable states of a task and their transitions.
 
-    State ``SATISFIED`` and state ``VIOLATED`` are absorbing and pay nothing.
+    States ``SATISFIED`` and ``VIOLATED`` are absorbing, with reward 0.
 
     Attributes:
         symbols: bool ``[K, P]``, the distinct label sets.
         node: int32 ``[M]``, the tree node a state is at, ``TaskTree.NO_NODE`` for the two absorbing ones.
         open_edges: bool ``[M, N]``, the edges that may still be taken.
-        successor: int32 ``[K, M, B]``, where symbol k leads from state m under choice b. Choice 0 is what happens
+        successor: int32 ``[K, M, B]``, the state after symbol k in state m under choice b. Choice 0 is the transition
             when no sub-task is assigned; choices beyond the last possible one repeat it.
         edge: int32 ``[K, M, B]``, the edge taken, ``TaskTree.NO_NODE`` for none.
-        reward: float32 ``[K, M, B]``, what the move pays.
-        initial: int32 ``[1 + C]``: entry 0 is the task's first state; entry 1 + c is the same, except that taking
-            any other first edge than that to ``children[c]`` ends the episode as violated and pays nothing.
+        reward: float32 ``[K, M, B]``, of the transition.
+        initial: int32 ``[1 + C]``: entry 0 is the task's initial state; entry 1 + c is the same, except that taking
+            any other first edge than that to ``children[c]`` ends the episode as violated, with reward 0.
         children: int32 ``[C]``, the root's children.
     """
 
     SATISFIED: ClassVar[int] = 0
     VIOLATED: ClassVar[int] = 1
 
-    symbols: np.ndarray  # bool [K, P]
-    node: np.ndarray  # int32 [M]
-    open_edges: np.ndarray  # bool [M, N]
-    successor: np.ndarray  # int32 [K, M, B]
-    edge: np.ndarray  # int32 [K, M, B]
-    reward: np.ndarray  # float32 [K, M, B]
-    initial: np.ndarray  # int32 [1 + C]
-    children: np.ndarray  # int32 [C]
+    symbols: Bool[np.ndarray, "K P"]
+    node: Int32[np.ndarray, " M"]
+    open_edges: Bool[np.ndarray, "M N"]
+    successor: Int32[np.ndarray, "K M B"]
+    edge: Int32[np.ndarray, "K M B"]
+    reward: Float32[np.ndarray, "K M B"]
+    initial: Int32[np.ndarray, " _"]  # [1 + C]
+    children: Int32[np.ndarray, " C"]
 
     @property
     def num_states(self) -> int:
@@ -67,22 +68,22 @@ class _State(NamedTuple):
 
 
 _Move = tuple[_State | int, int, float]
-"""Where to (a running state or an absorbing one's number), the edge taken, the reward."""
+"""A transition: the next state (a running one, or an absorbing one's number), the edge taken, the reward."""
 
 _WAITING, _ARMED, _OVER = RewardMachine.WAITING, RewardMachine.ARMED, RewardMachine.PAID
 _ANY = TaskTree.NO_NODE
 
 
-def automaton(tree: TaskTree, symbols: np.ndarray, rewards: RewardMachine | None = None) -> Automaton:
-    """Enumerates the states of a task that some sequence of the given label sets can reach.
+def automaton(tree: TaskTree, symbols: Bool[np.ndarray, "..."], rewards: RewardMachine | None = None) -> Automaton:
+    """Enumerates the states of a task that are reachable by sequences of the given label sets.
 
     Args:
         tree: one task (unbatched).
         symbols: bool ``[K, P]``, the label sets that occur, each once.
-        rewards: what is paid; 1 for completing the task and nothing else if not given.
+        rewards: of the task; by default 1 for completing it.
 
     Raises:
-        ValueError: if tree, symbols and rewards do not speak of the same number of propositions.
+        ValueError: if tree, symbols and rewards are over different numbers of propositions.
     """
     rules = _Rules(tree, rewards)
     if symbols.ndim != 2 or symbols.shape[1] != tree.num_propositions:
@@ -113,10 +114,10 @@ def _tabulate(
     table: list[list[list[tuple[int, int, float]]]],
     states: Sequence[_State],
     starts: Sequence[int],
-    symbols: np.ndarray,
+    symbols: Bool[np.ndarray, "K P"],
     rules: _Rules,
 ) -> Automaton:
-    """The enumerated moves as arrays, with the absorbing states in front."""
+    """The enumerated transitions as arrays, with the absorbing states in front."""
     num_symbols, num_states = len(symbols), len(states) + 2
     width = max((len(options) for moves in table for options in moves), default=1)
     successor = np.zeros((num_symbols, num_states, width), np.int32)
@@ -143,7 +144,7 @@ def _tabulate(
 
 
 class _Rules:
-    """One task and its rewards as Python numbers, and the rules that move them."""
+    """One task and its rewards as Python numbers, and their transition function."""
 
     def __init__(self, tree: TaskTree, rewards: RewardMachine | None) -> None:
         parent, valid = np.asarray(tree.parent).tolist(), np.asarray(tree.valid).tolist()
@@ -168,7 +169,7 @@ class _Rules:
         self.payable = [[self._payable(node, rule) for rule in self.bonuses] for node in range(self.num_nodes)]
 
     def moves(self, state: _State, labels: int) -> list[_Move]:
-        """What one label set can do to a state; the move that happens when nothing is assigned comes first."""
+        """Transitions of a state on one label set; the first is the one when no sub-task is assigned."""
         edges = [child for child in self.children[state.node] if not state.blocked >> child & 1]
         unharmed = [child for child in edges if not self.avoid[child] & labels]
         met = [child for child in unharmed if self.reach[child] & ~labels == 0]
@@ -194,7 +195,7 @@ class _Rules:
     def forward(
         self, node: int, rules: tuple[int, ...], labels: int, reached: int | None
     ) -> tuple[tuple[int, ...], float]:
-        """Moves the bonus rules by one label set and the reach of the edge taken (``None`` without one)."""
+        """Next states of the bonus rules and their reward, given labels and the reach set of the edge taken, if any."""
         after, paid = [], 0.0
         for (first, second, avoid, bonus), rule in zip(self.bonuses, rules, strict=True):
             if rule == _WAITING and avoid & labels:
@@ -208,14 +209,14 @@ class _Rules:
         return self.forget(node, tuple(after)), paid
 
     def forget(self, node: int, rules: tuple[int, ...]) -> tuple[int, ...]:
-        """Calls rules over that nothing below ``node`` can make pay any more: fewer states, the same rewards."""
+        """Merges the states of rules that no path below ``node`` can make pay: fewer states, the same rewards."""
         return tuple(
             _OVER if rule == _OVER or not can_pay[rule] else rule
             for can_pay, rule in zip(self.payable[node], rules, strict=True)
         )
 
     def _payable(self, node: int, rule: tuple[int, int, int, float]) -> tuple[bool, bool]:
-        """Whether a rule that waits, and one that is armed, can still pay on some path below ``node``."""
+        """Whether a waiting rule, and an armed one, can still pay on some path below ``node``."""
         first, second, _, _ = rule
         pending = [(child, False) for child in self.children[node]]
         waiting = armed = False
@@ -228,6 +229,6 @@ class _Rules:
         return waiting, armed
 
 
-def _mask(flags: Iterable[bool]) -> int:
-    """A set as the bits of a number."""
+def _mask(flags: Bool[np.ndarray, " P"]) -> int:
+    """A set as the bits of an integer."""
     return sum(1 << i for i, flag in enumerate(flags) if flag)

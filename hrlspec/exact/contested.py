@@ -1,9 +1,9 @@
 """Contested choices: layouts where going to the nearest goal first costs steps later.
 
-The tasks are two sub-tasks in sequence, ``achieve a; achieve b``. Where the nearest a leads to a longer path in all,
-only an agent that looks ahead passes it by; in the mirrored controls the nearest a is the right one.
+The tasks are two sub-tasks in sequence, ``achieve a; achieve b``. Where the total path through the nearest a is longer
+than another, only an agent that looks ahead chooses the other; in the mirrored controls the nearest a is optimal.
 
-Axes: **L** layouts, **S** graph states, **N** tree nodes, **P** atomic propositions, **Q** cases of a suite.
+Axes: **L** layouts, **S** graph states, **P** atomic propositions, **Q** cases of a suite.
 """
 
 from __future__ import annotations
@@ -15,49 +15,51 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float32, Int, Key
 
 from envs_jax import ContestedChoice, Environment, FiniteGraph
+from envs_jax.arrays import Array
 from envs_jax.base import Layout, State
 from hrlspec.exact.automaton import Automaton
 from hrlspec.exact.solver import Graph, product, steps_table, tabulate
 from hrlspec.spec.tree import TaskTree
 
 Contestable = FiniteGraph | ContestedChoice
-"""Environments in which it is known which instance of the first goal is the right one; ask with ``isinstance``."""
+"""Environments in which the optimal instance of the first goal is known; test with ``isinstance``."""
 
 
 class FirstVisits(NamedTuple):
-    """What it takes to complete a task when its first edge is taken in a given state, each float32 ``[L, S]``.
+    """Steps to complete a task, by the state in which its first edge is taken, each float32 ``[L, S]``.
 
     Attributes:
         steps: least steps until the first edge is taken there, inf where it cannot be.
         total: least steps until the task is satisfied after that, those before included.
     """
 
-    steps: np.ndarray
-    total: np.ndarray
+    steps: Float32[np.ndarray, "L S"]
+    total: Float32[np.ndarray, "L S"]
 
 
 class Contested(NamedTuple):
-    """Which layouts tell a planning agent from one that takes the nearest goal first.
+    """Which layouts distinguish a planning agent from one that takes the nearest goal first.
 
     Attributes:
         contested: bool ``[L]``, the nearest first goal costs at least the margin more in all than the best.
         control: bool ``[L]``, every other first goal costs at least the margin more than the nearest.
-        right: bool ``[L, S]``, states where taking the first edge is a right choice: the total is the least.
+        right: bool ``[L, S]``, states where taking the first edge is optimal: the total is the least.
         nearest: int ``[L]``, the state in which the first edge can be taken soonest.
         optimum: float32 ``[L]``, least steps to satisfaction.
     """
 
-    contested: np.ndarray
-    control: np.ndarray
-    right: np.ndarray
-    nearest: np.ndarray
-    optimum: np.ndarray
+    contested: Bool[np.ndarray, " L"]
+    control: Bool[np.ndarray, " L"]
+    right: Bool[np.ndarray, "L S"]
+    nearest: Int[np.ndarray, " L"]
+    optimum: Float32[np.ndarray, " L"]
 
 
 class ContestedSuite(NamedTuple):
-    """Cases to score an agent on, in equal numbers contested and controls.
+    """Cases to score an agent on, half of them contested, half of them controls.
 
     A choice is right when the first edge is taken in one of the states ``right``; a case without a first edge, or a
     task that is not satisfied in the end, counts as wrong. The score is the mean of the two rates.
@@ -73,10 +75,10 @@ class ContestedSuite(NamedTuple):
 
     layouts: Layout
     tasks: TaskTree
-    contested: np.ndarray
-    right: np.ndarray
-    nearest: np.ndarray
-    optimum: np.ndarray
+    contested: Bool[np.ndarray, " Q"]
+    right: Bool[np.ndarray, "Q S"]
+    nearest: Int[np.ndarray, " Q"]
+    optimum: Float32[np.ndarray, " Q"]
 
 
 def two_step_task(first: int, second: int, num_propositions: int) -> TaskTree:
@@ -130,14 +132,14 @@ def first_visits(graph: Graph, tree: TaskTree) -> FirstVisits:
 
 
 def find_contested(graph: Graph, tree: TaskTree, *, margin: int = 2) -> Contested:
-    """Says which layouts are contested, and which are controls, for one task.
+    """Classifies layouts as contested, control or neither, for one task.
 
     Layouts without a unique nearest first goal, or whose task cannot be satisfied, are neither.
 
     Args:
         graph: L layouts.
         tree: one task (unbatched), meant for those of two sub-tasks in sequence.
-        margin: steps that the wrong choice must cost at least.
+        margin: least number of additional steps that the wrong choice costs.
     """
     steps, total = first_visits(graph, tree)
     layouts, nearest = np.arange(graph.num_layouts), steps.argmin(-1)
@@ -145,7 +147,7 @@ def find_contested(graph: Graph, tree: TaskTree, *, margin: int = 2) -> Conteste
     usable = np.isfinite(best) & ((steps == steps.min(-1, keepdims=True)).sum(-1) == 1)
     others = total.copy()
     others[layouts, nearest] = np.inf
-    # There must be another instance to choose, or a control would ask nothing.
+    # Without a second instance there is no choice, and a control would test nothing.
     rival = np.where(np.isfinite(others).any(-1), others.min(-1), -np.inf)
     return Contested(
         contested=usable & (of_nearest >= np.where(usable, best, 0) + margin),
@@ -157,7 +159,7 @@ def find_contested(graph: Graph, tree: TaskTree, *, margin: int = 2) -> Conteste
 
 
 def contested_suite(
-    key: jax.Array, env: Environment, *, num_cases: int, margin: int = 2, most_rounds: int = 200
+    key: Key[Array, ""], env: Environment, *, num_cases: int, margin: int = 2, most_rounds: int = 200
 ) -> ContestedSuite:
     """Contested layouts of an environment, and as many controls.
 
@@ -187,8 +189,8 @@ def contested_suite(
     raise _not_contestable(env)
 
 
-def chosen_instances(env: Environment, states: State, first: np.ndarray) -> np.ndarray:
-    """Where first goals were reached, in the terms of ``ContestedSuite.right``, int ``[Q]``.
+def chosen_instances(env: Environment, states: State, first: Bool[np.ndarray, "Q P"]) -> Int[np.ndarray, " Q"]:
+    """Where first goals were reached, as indices into the columns of ``ContestedSuite.right``, int ``[Q]``.
 
     Args:
         env: the suite's environment.
@@ -209,7 +211,7 @@ def _not_contestable(env: Environment) -> ValueError:
     return ValueError(f"{env.name} has no exact solver and no contested layouts, so contested choice is not known")
 
 
-def _found_suite(key: jax.Array, env: FiniteGraph, wanted: int, margin: int, most_rounds: int) -> ContestedSuite:
+def _found_suite(key: Key[Array, ""], env: FiniteGraph, wanted: int, margin: int, most_rounds: int) -> ContestedSuite:
     """Random layouts until ``wanted`` of them are contested and as many are controls."""
     kept: dict[bool, list[tuple[Any, ...]]] = {True: [], False: []}
     pairs = itertools.cycle(itertools.permutations(range(env.num_propositions), 2))
@@ -233,8 +235,8 @@ def _found_suite(key: jax.Array, env: FiniteGraph, wanted: int, margin: int, mos
     raise ValueError(f"{env.name}: only {found_so_far} in {512 * most_rounds} layouts, {wanted} of each are wanted")
 
 
-def _drawn_suite(key: jax.Array, env: ContestedChoice, wanted: int) -> ContestedSuite:
-    """Contested layouts and, with the same keys, their mirrored controls; instance 0 is the right one on both."""
+def _drawn_suite(key: Key[Array, ""], env: ContestedChoice, wanted: int) -> ContestedSuite:
+    """Contested layouts and, with the same keys, their mirrored controls; instance 0 is optimal in both."""
     pairs = itertools.islice(itertools.cycle(env.contested_pairs), wanted)
     trees = [two_step_task(first, second, env.num_propositions) for first, second in pairs]
     tasks: TaskTree = jax.tree.map(lambda *leaves: np.stack(leaves * 2), *trees)
@@ -254,7 +256,11 @@ def _drawn_suite(key: jax.Array, env: ContestedChoice, wanted: int) -> Contested
 
 @functools.partial(jax.jit, static_argnums=0)
 def _contested_layouts(
-    env: ContestedChoice, keys: jax.Array, first: jax.Array, second: jax.Array, mirrored: jax.Array
+    env: ContestedChoice,
+    keys: Key[Array, " Q"],
+    first: Bool[Array, "Q P"],
+    second: Bool[Array, "Q P"],
+    mirrored: Bool[Array, " Q"],
 ) -> Layout:
     """One layout for each key."""
     draw = functools.partial(env.contested_layout, params=env.default_params)
@@ -262,6 +268,6 @@ def _contested_layouts(
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _sample_layouts(env: Environment, keys: jax.Array) -> Layout:
+def _sample_layouts(env: Environment, keys: Key[Array, " L"]) -> Layout:
     """One layout for each key."""
     return jax.vmap(env.sample_layout, (0, None))(keys, env.default_params)

@@ -1,4 +1,4 @@
-"""Reference agents on finite labelled graphs, for a planning agent to beat: nearest goal first, blind first choices.
+"""Reference agents on finite labelled graphs: nearest goal first, and uninformed choices of the first edge.
 
 Axes: **L** layouts, **S** graph states, **A** actions, **N** tree nodes, **C** children of the root.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float32, Int
 
 from hrlspec.exact.automaton import Automaton
 from hrlspec.exact.solver import Graph, Product, branch_returns, product, root_children
@@ -15,11 +16,11 @@ from hrlspec.spec.tree import TaskTree, subtask_avoid
 from hrlspec.tasks.rewards import RewardMachine
 
 
-def myopic_steps(graph: Graph, tree: TaskTree) -> np.ndarray:
+def myopic_steps(graph: Graph, tree: TaskTree) -> Float32[np.ndarray, " L"]:
     """Steps of an agent that always goes to the nearest goal among the open sub-tasks, by a shortest path.
 
     Paths keep clear of what the sub-task avoids (eq. 2). Ties go to the sub-task of the lowest node, then to the
-    action of the lowest number. An agent without a goal in reach has failed.
+    action of the lowest number. The agent fails where it can reach no goal.
 
     Args:
         graph: L layouts.
@@ -35,7 +36,7 @@ def myopic_steps(graph: Graph, tree: TaskTree) -> np.ndarray:
     place, state = graph.start.copy(), np.full(graph.num_layouts, machine.initial[0])
     steps = np.zeros(graph.num_layouts, np.float32)
     while True:
-        # Each turn is one step nearer to a goal, and there are finitely many goals on a path down the tree.
+        # Each iteration is one step nearer to a goal, and a path down the tree has finitely many goals.
         following = graph.successors[layouts, place]  # int [L, A]
         ahead = entering[layouts[:, None], :, following]  # float [L, A, N]
         ahead = np.where(machine.open_edges[state][:, None, :], ahead, np.inf)
@@ -51,7 +52,7 @@ def myopic_steps(graph: Graph, tree: TaskTree) -> np.ndarray:
         steps += moving
 
 
-def _entering_distances(graph: Graph, run: Product, tree: TaskTree) -> np.ndarray:
+def _entering_distances(graph: Graph, run: Product, tree: TaskTree) -> Float32[np.ndarray, "L N S"]:
     """Further steps to each sub-task's nearest goal after entering a state, float32 ``[L, N, S]``.
 
     0 at goals, inf where the sub-task avoids what holds. Round k finds the states at distance k.
@@ -77,32 +78,32 @@ class BranchScores(NamedTuple):
     """Undiscounted returns on one task under a reward set, each float32 ``[L]``.
 
     Attributes:
-        optimal: of the best agent.
-        random: expected, of an agent that draws its first edge uniformly and is the best from then on.
-        longest: of one that takes the first edge with the longest path below it (the mean over ties) and is the best
+        optimal: of the optimal agent.
+        random: expected, of an agent that draws its first edge uniformly and is optimal from then on.
+        longest: of one that takes the first edge with the longest path below it (the mean over ties) and is optimal
             from then on.
         matters: bool ``[L]``, whether the branches' optima differ by 30 % of the largest or more.
     """
 
-    optimal: np.ndarray
-    random: np.ndarray
-    longest: np.ndarray
-    matters: np.ndarray
+    optimal: Float32[np.ndarray, " L"]
+    random: Float32[np.ndarray, " L"]
+    longest: Float32[np.ndarray, " L"]
+    matters: Bool[np.ndarray, " L"]
 
 
 def branch_scores(
     graph: Graph, tree: TaskTree, rewards: RewardMachine | None, horizon: int, *, least_difference: float = 0.3
 ) -> BranchScores:
-    """How much the choice of the first edge matters, and what choosing without looking gets.
+    """Optimal return, and the returns of uninformed choices of the first edge.
 
     A branch that cannot be entered within the horizon counts 0.
 
     Args:
         graph: L layouts.
         tree: one task (unbatched).
-        rewards: what is paid; 1 for completing the task if ``None``.
+        rewards: of the task; 1 for completing it if ``None``.
         horizon: steps in an episode.
-        least_difference: from what share of the largest branch optimum on the branch is said to matter.
+        least_difference: the branch matters where the branches' optima differ by at least this share of the largest.
     """
     branches = branch_returns(graph, tree, rewards, horizon)
     best = branches.max(-1)
@@ -115,7 +116,7 @@ def branch_scores(
     )
 
 
-def _heights(tree: TaskTree) -> np.ndarray:
+def _heights(tree: TaskTree) -> Int[np.ndarray, " N"]:
     """Edges on the longest path down from each node, int ``[N]``."""
     parent, valid = np.asarray(tree.parent), np.asarray(tree.valid)
     height = np.zeros(tree.num_nodes, int)

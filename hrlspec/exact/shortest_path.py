@@ -1,9 +1,9 @@
-"""Shortest paths for worlds whose steps lead anywhere in a small square, by planning on the map.
+"""Shortest paths in planar environments whose actions lead anywhere within a small square, by search on a grid.
 
-They measure agents in continuous worlds as :mod:`hrlspec.exact.solver` does in finite ones. The map is that of a
-:class:`envs_jax.GridMap`: the places that whole steps lead to, from each to its eight neighbours or nowhere. On it a
-path takes max(|Δx|, |Δy|) steps, as in the world itself, so every path found is one the environment allows, and what
-is lost is less than a step for each sub-task: goals are entered at a place of the grid.
+They are the optima of continuous environments, as :mod:`hrlspec.exact.solver` has those of finite ones. The grid is
+that of a :class:`envs_jax.GridMap`: the places that whole steps lead to, from each to its eight neighbours or nowhere.
+On it a path takes max(|Δx|, |Δy|) steps, as in the environment itself, so every path found is one the environment
+allows, and the excess is less than a step for each sub-task: goals are entered at a place of the grid.
 
 Axes: **L** layouts, **X**, **Y** places, **P** atomic propositions, **K** label sets, **M** automaton states.
 """
@@ -15,6 +15,7 @@ from collections.abc import Iterator
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float32, Int
 
 from envs_jax import GridMap
 from envs_jax.base import Layout
@@ -33,17 +34,17 @@ class Grid:
         start: int ``[L, 2]``, where episodes begin (labels of the start count only when it is entered again).
     """
 
-    symbols: np.ndarray  # bool [K, P]
-    symbol: np.ndarray  # int [L, X, Y]
-    inside: np.ndarray  # bool [L, X, Y]
-    start: np.ndarray  # int [L, 2]
+    symbols: Bool[np.ndarray, "K P"]
+    symbol: Int[np.ndarray, "L X Y"]
+    inside: Bool[np.ndarray, "L X Y"]
+    start: Int[np.ndarray, "L 2"]
 
     @property
     def num_layouts(self) -> int:
         """L."""
         return len(self.start)
 
-    def __getitem__(self, rows: slice | np.ndarray) -> Grid:
+    def __getitem__(self, rows: slice | Int[np.ndarray, " _"] | Bool[np.ndarray, " L"]) -> Grid:
         """Some of the layouts."""
         return Grid(self.symbols, self.symbol[rows], self.inside[rows], self.start[rows])
 
@@ -58,8 +59,10 @@ def grid_of(env: GridMap, layouts: Layout) -> Grid:
     return Grid(flat[first], symbol.reshape(labels.shape[:-1]), inside, start)
 
 
-def planned_steps(env: GridMap, layouts: Layout, tree: TaskTree) -> tuple[np.ndarray, np.ndarray]:
-    """What :func:`shortest_steps` and :func:`nearest_first_steps` give for a task; layouts that are alike cost once.
+def planned_steps(
+    env: GridMap, layouts: Layout, tree: TaskTree
+) -> tuple[Float32[np.ndarray, " L"], Float32[np.ndarray, " L"]]:
+    """:func:`shortest_steps` and :func:`nearest_first_steps` of a task; equal layouts are solved once.
 
     Args:
         env: the environment.
@@ -77,10 +80,10 @@ def planned_steps(env: GridMap, layouts: Layout, tree: TaskTree) -> tuple[np.nda
     return shortest_steps(grid, tree)[which], nearest_first_steps(grid, tree)[which]
 
 
-def shortest_steps(grid: Grid, tree: TaskTree) -> np.ndarray:
-    """The least number of steps that satisfies a task in the committed reading, inf where nothing does.
+def shortest_steps(grid: Grid, tree: TaskTree) -> Float32[np.ndarray, " L"]:
+    """The least number of steps that satisfies a task under the committed semantics, inf where none does.
 
-    Where several edges are met at once the agent may have assigned any of them, so the best counts.
+    Where several edges are met at once the agent may have assigned any of them, so the least counts.
 
     Args:
         grid: L layouts.
@@ -95,11 +98,11 @@ def shortest_steps(grid: Grid, tree: TaskTree) -> np.ndarray:
     return steps[(np.arange(grid.num_layouts), *grid.start.T)]
 
 
-def nearest_first_steps(grid: Grid, tree: TaskTree) -> np.ndarray:
+def nearest_first_steps(grid: Grid, tree: TaskTree) -> Float32[np.ndarray, " L"]:
     """Steps of an agent that always goes to the nearest goal among the open sub-tasks, by a shortest path.
 
     Paths keep clear of what the sub-task avoids (eq. 2). Ties go to the sub-task of the lowest node, then to the
-    neighbour of the lowest index. An agent without a goal in reach has failed.
+    neighbour of the lowest index. The agent fails where it can reach no goal.
 
     Args:
         grid: L layouts.
@@ -144,11 +147,11 @@ def _nearest_first(one: Grid, tree: TaskTree, machine: Automaton) -> float:
     return float(steps)
 
 
-def _steps_tables(grid: Grid, machine: Automaton) -> dict[int, np.ndarray]:
+def _steps_tables(grid: Grid, machine: Automaton) -> dict[int, Float32[np.ndarray, "L X Y"]]:
     """Least further steps to satisfaction from each place, float32 ``[L, X, Y]``, for each running automaton state.
 
-    The automaton never comes back to a state that it left, so states are solved from the last to the first: what
-    leaving a state is worth is known, and within it nothing but distance counts.
+    The automaton never returns to a state that it left, so states are solved in reverse topological order: the steps
+    after leaving a state are known, and within the state only distance matters.
     """
     tables: dict[int, np.ndarray] = {}
     shape = grid.symbol.shape
@@ -172,7 +175,7 @@ def _steps_tables(grid: Grid, machine: Automaton) -> dict[int, np.ndarray]:
 
 
 def _successors_first(machine: Automaton) -> Iterator[int]:
-    """The running states that the initial one leads to, each after all that it leads to."""
+    """The running states reachable from the initial one, in reverse topological order."""
     seen: set[int] = {Automaton.SATISFIED, Automaton.VIOLATED}
 
     def visit(state: int) -> Iterator[int]:
@@ -185,8 +188,10 @@ def _successors_first(machine: Automaton) -> Iterator[int]:
     yield from visit(int(machine.initial[0]))
 
 
-def _path_lengths(ends: np.ndarray, closed: np.ndarray) -> np.ndarray:
-    """Steps from each place to the best end, float32 ``[L, X, Y]``: at least 1, inf where there is no path.
+def _path_lengths(
+    ends: Float32[np.ndarray, "L X Y"], closed: Bool[np.ndarray, "L X Y"]
+) -> Float32[np.ndarray, "L X Y"]:
+    """Steps from each place to the nearest end, float32 ``[L, X, Y]``: at least 1, inf where there is no path.
 
     Args:
         ends: float32 ``[L, X, Y]``, further steps counted on entering an end; used where ``closed``.
@@ -214,7 +219,7 @@ def _path_lengths(ends: np.ndarray, closed: np.ndarray) -> np.ndarray:
 
 
 def _neighbours(one: Grid, place: tuple[int, int]) -> Iterator[tuple[int, int]]:
-    """Where one step leads, the place itself included."""
+    """The places that one step leads to, the place itself included."""
     width, height = one.inside.shape[1:]
     for x in range(max(place[0] - 1, 0), min(place[0] + 2, width)):
         for y in range(max(place[1] - 1, 0), min(place[1] + 2, height)):

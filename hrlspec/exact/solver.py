@@ -1,4 +1,4 @@
-"""Exact optima of tasks on finite labelled graphs: what evaluation measures agents against, and tests the library.
+"""Exact optima of tasks on finite labelled graphs: references for evaluation and for the tests of the library.
 
 Dynamic programming over graph state × automaton state (and time left for returns), for environments that are a
 :class:`envs_jax.FiniteGraph`. Numpy, vectorised over layouts.
@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float32, Int
 
 from envs_jax import FiniteGraph
 from envs_jax.base import Layout
@@ -28,7 +28,7 @@ MOST_VALUES = 4_000_000
 
 @dataclasses.dataclass(frozen=True)
 class Graph:
-    """Deterministic labelled graphs, one for each layout.
+    """Deterministic labelled transition graphs, one for each layout.
 
     Attributes:
         successors: int ``[L, S, A]``, the state each action leads to.
@@ -36,17 +36,17 @@ class Graph:
         start: int ``[L]``, where episodes begin (labels of the start count only when it is entered again).
     """
 
-    successors: np.ndarray  # int [L, S, A]
-    labels: np.ndarray  # bool [L, S, P]
-    start: np.ndarray  # int [L]
+    successors: Int[np.ndarray, "L S A"]
+    labels: Bool[np.ndarray, "L S P"]
+    start: Int[np.ndarray, " L"]
 
     @property
     def num_layouts(self) -> int:
         """L."""
         return self.labels.shape[0]
 
-    def __getitem__(self, index: Any) -> Graph:
-        """Some of the layouts, by anything that indexes an axis and keeps it."""
+    def __getitem__(self, index: slice | list[int] | Int[np.ndarray, " _"] | Bool[np.ndarray, " _"]) -> Graph:
+        """Some of the layouts."""
         return Graph(self.successors[index], self.labels[index], self.start[index])
 
 
@@ -57,10 +57,10 @@ def tabulate(env: FiniteGraph, layouts: Layout) -> Graph:
     return Graph(successors.astype(np.int64), labels.astype(bool), start.astype(np.int64))
 
 
-def optimal_steps(graph: Graph, tree: TaskTree) -> np.ndarray:
-    """The least number of steps that satisfies a task in the committed reading, inf where nothing does.
+def optimal_steps(graph: Graph, tree: TaskTree) -> Float32[np.ndarray, " L"]:
+    """The least number of steps that satisfies a task under the committed semantics, inf where none does.
 
-    Where several edges are met at once the agent may have assigned any of them, so the best counts.
+    Where several edges are met at once the agent may have assigned any of them, so the least counts.
 
     Args:
         graph: L layouts.
@@ -72,15 +72,17 @@ def optimal_steps(graph: Graph, tree: TaskTree) -> np.ndarray:
     return _from_start(graph, tree, None, steps_table)[:, 0]
 
 
-def branch_returns(graph: Graph, tree: TaskTree, rewards: RewardMachine | None, horizon: int) -> np.ndarray:
-    """The largest undiscounted return when no first edge but that to each of the root's children may be taken.
+def branch_returns(
+    graph: Graph, tree: TaskTree, rewards: RewardMachine | None, horizon: int
+) -> Float32[np.ndarray, "L C"]:
+    """The optimal undiscounted return of each branch: only the first edge to that child of the root may be taken.
 
-    Episodes end on satisfaction, violation or the horizon. The largest of all branches is the optimum.
+    Episodes end on satisfaction, violation or the horizon. The maximum over branches is the optimum.
 
     Args:
         graph: L layouts.
         tree: one task (unbatched).
-        rewards: what is paid; 1 for completing the task if ``None``.
+        rewards: of the task; 1 for completing it if ``None``.
         horizon: steps in an episode.
 
     Returns:
@@ -89,15 +91,15 @@ def branch_returns(graph: Graph, tree: TaskTree, rewards: RewardMachine | None, 
     return _from_start(graph, tree, rewards, lambda one: returns_table(one, horizon))[:, 1:]
 
 
-def root_children(tree: TaskTree) -> np.ndarray:
-    """The nodes that the columns of branch results stand for, int ``[C]``."""
+def root_children(tree: TaskTree) -> Int[np.ndarray, " C"]:
+    """The root's children, in the order of the columns of :func:`branch_returns`, int ``[C]``."""
     return np.flatnonzero(np.asarray(tree.valid) & (np.asarray(tree.parent) == TaskTree.ROOT))
 
 
-def steps_table(product: Product) -> np.ndarray:
-    """Least steps to satisfaction from everywhere, float32 ``[L, S, M]``, inf where there is no path.
+def steps_table(product: Product) -> Float32[np.ndarray, "L S M"]:
+    """Least steps to satisfaction from every state, float32 ``[L, S, M]``, inf where there is no path.
 
-    Values of exactly k steps appear in round k and never change, so a round that adds none is the last.
+    Values of exactly k steps appear in sweep k and never change, so a sweep that adds none is the last.
     """
     machine = product.automaton
     steps = np.full((product.num_rows, machine.num_states), np.inf, np.float32)
@@ -112,33 +114,33 @@ def steps_table(product: Product) -> np.ndarray:
     return steps.reshape(*product.shape, machine.num_states)
 
 
-def returns_table(product: Product, horizon: int) -> np.ndarray:
-    """Largest return with ``horizon`` steps left, from everywhere, float32 ``[L, S, M]``."""
+def returns_table(product: Product, horizon: int) -> Float32[np.ndarray, "L S M"]:
+    """Optimal return with ``horizon`` steps left, from every state, float32 ``[L, S, M]``."""
     values = np.zeros((product.num_rows, product.automaton.num_states), np.float32)
     for _ in range(horizon):
         following = product.act(product.enter(values, np.maximum, rewarded=True), np.maximum)
         if np.array_equal(following, values):
-            break  # Nothing more to gain however much time is left.
+            break  # A fixed point: more steps earn nothing.
         values = following
     return values.reshape(*product.shape, product.automaton.num_states)
 
 
 class Product:
-    """Graphs beside a task's automaton: rows are (layout, graph state), columns automaton states.
+    """The product of graphs with a task's automaton: rows are (layout, graph state), columns automaton states.
 
     Attributes:
-        automaton: the task's.
+        automaton: of the task.
         symbol: int ``[L, S]``, the label set of each graph state, a row of ``automaton.symbols``.
         shape: (L, S).
     """
 
-    def __init__(self, graph: Graph, machine: Automaton, symbol: np.ndarray) -> None:
-        """Lays out the tables; :func:`product` finds ``machine`` and ``symbol``."""
+    def __init__(self, graph: Graph, machine: Automaton, symbol: Int[np.ndarray, "L S"]) -> None:
+        """Builds the tables; :func:`product` computes ``machine`` and ``symbol``."""
         num_layouts, num_states = symbol.shape
         self.automaton, self.symbol, self.shape = machine, symbol, (num_layouts, num_states)
         first_row = num_states * np.arange(num_layouts)
         self._next_row = (graph.successors + first_row[:, None, None]).reshape(-1, graph.successors.shape[-1])
-        # Most states bear no label, and then nothing happens to the task: only the others are looked up.
+        # Most states have no label and leave the automaton where it is: only the others are looked up.
         at_rest = machine.successor == np.arange(machine.num_states)[:, None]
         inert = at_rest.all((1, 2)) & (machine.reward == 0).all((1, 2))
         flat = symbol.reshape(-1)
@@ -152,8 +154,10 @@ class Product:
         """L · S."""
         return self.shape[0] * self.shape[1]
 
-    def enter(self, values: np.ndarray, best: np.ufunc, *, rewarded: bool = False) -> np.ndarray:
-        """The value of entering each row: its labels move the automaton, then ``values`` ``[L·S, M]`` counts."""
+    def enter(
+        self, values: Float32[np.ndarray, "rows M"], best: np.ufunc, *, rewarded: bool = False
+    ) -> Float32[np.ndarray, "rows M"]:
+        """Values of entering each row: ``values`` ``[L·S, M]`` after the transition of the automaton on its labels."""
         entered = values.copy()
         outcomes = values.reshape(-1)[self._choices]
         if rewarded:
@@ -161,8 +165,8 @@ class Product:
         entered[self._rows] = best.reduce(outcomes, axis=-1)
         return entered
 
-    def act(self, entered: np.ndarray, best: np.ufunc) -> np.ndarray:
-        """The value of the best action in each row, ``[L·S, M]``."""
+    def act(self, entered: Float32[np.ndarray, "rows M"], best: np.ufunc) -> Float32[np.ndarray, "rows M"]:
+        """Values of the best action in each row, ``[L·S, M]``."""
         result = entered[self._next_row[:, 0]]
         for action in range(1, self._next_row.shape[1]):
             best(result, entered[self._next_row[:, action]], out=result)
@@ -170,18 +174,21 @@ class Product:
 
 
 def product(graph: Graph, tree: TaskTree, rewards: RewardMachine | None = None) -> Product:
-    """All layouts beside the task's automaton.
+    """The product of all layouts with the task's automaton.
 
     Raises:
-        ValueError: if graphs, tree and rewards do not speak of the same number of propositions.
+        ValueError: if graphs, tree and rewards are over different numbers of propositions.
     """
     return Product(graph, *_machine(graph, tree, rewards))
 
 
 def _from_start(
-    graph: Graph, tree: TaskTree, rewards: RewardMachine | None, solve: Callable[[Product], np.ndarray]
-) -> np.ndarray:
-    """A table's values at the start for each of the automaton's initial states, float32 ``[L, 1 + C]``."""
+    graph: Graph,
+    tree: TaskTree,
+    rewards: RewardMachine | None,
+    solve: Callable[[Product], Float32[np.ndarray, "L S M"]],
+) -> Float32[np.ndarray, "L _"]:
+    """Values at the start state for each of the automaton's initial states, float32 ``[L, 1 + C]``."""
     machine, symbol = _machine(graph, tree, rewards)
     size = max(1, MOST_VALUES // (symbol.shape[1] * machine.num_states))
     values = np.empty((graph.num_layouts, len(machine.initial)), np.float32)
@@ -193,14 +200,14 @@ def _from_start(
     return values
 
 
-def _machine(graph: Graph, tree: TaskTree, rewards: RewardMachine | None) -> tuple[Automaton, np.ndarray]:
-    """The task's automaton over the label sets that occur, and which of them each state bears, int ``[L, S]``."""
+def _machine(graph: Graph, tree: TaskTree, rewards: RewardMachine | None) -> tuple[Automaton, Int[np.ndarray, "L S"]]:
+    """The task's automaton over the label sets that occur, and the label set of each state, int ``[L, S]``."""
     symbols, symbol = _distinct(graph.labels.reshape(-1, graph.labels.shape[-1]))
     return automaton(tree, symbols, rewards), symbol.reshape(graph.labels.shape[:2])
 
 
-def _distinct(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The distinct rows, bool ``[K, P]``, and which of them each row is, int ``[rows]``."""
+def _distinct(labels: Bool[np.ndarray, "rows P"]) -> tuple[Bool[np.ndarray, "K P"], Int[np.ndarray, " rows"]]:
+    """The distinct rows, bool ``[K, P]``, and the index of each row among them, int ``[rows]``."""
     packed = np.packbits(labels, axis=-1)
     words = np.ascontiguousarray(packed).view(np.dtype((np.void, packed.shape[-1])))[:, 0]
     _, first, which = np.unique(words, return_index=True, return_inverse=True)

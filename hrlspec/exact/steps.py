@@ -1,4 +1,4 @@
-"""Steps that a task takes at least, and those of the nearest-first agent, from whatever map an environment has.
+"""Optimal steps of a task and those of the nearest-first agent, from the graph or grid of an environment.
 
 Axes: **L** layouts.
 """
@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float32
 
 from envs_jax import Environment, FiniteGraph, GridMap
 from envs_jax.base import Layout
@@ -20,19 +21,19 @@ from hrlspec.spec.tree import TaskTree
 
 
 class Steps(NamedTuple):
-    """Steps to satisfaction of a task in the committed reading, each float32 ``[L]``.
+    """Steps to satisfaction of a task under the committed semantics, each float32 ``[L]``.
 
     Attributes:
-        optimum: the least; inf where nothing satisfies the task.
-        myopic: those of the agent that always goes to the nearest goal; inf where it fails.
+        optimum: the least; inf where the task cannot be satisfied.
+        myopic: of the agent that always goes to the nearest goal; inf where it fails.
     """
 
-    optimum: np.ndarray
-    myopic: np.ndarray
+    optimum: Float32[np.ndarray, " L"]
+    myopic: Float32[np.ndarray, " L"]
 
 
 def step_solver(env: Environment, layouts: Layout) -> Callable[[slice, TaskTree], Steps] | None:
-    """A function of a slice of the layouts and a task; ``None`` for environments that have no map.
+    """A function of a slice of the layouts and a task; ``None`` for environments without graph or grid.
 
     Exact where the environment is a finite graph, within a step for each sub-task where it has a grid.
 
