@@ -6,6 +6,10 @@ import os
 
 import jax
 
+from tests import typecheck
+
+typecheck.install()  # before anything that is to be checked is imported
+
 from hrlspec.run.platform import compiled_quickly, with_loop_option
 
 # Before the first array is made, so that tests and the processes they start run the same programs, to the bit.

@@ -17,7 +17,18 @@ from flax import struct
 
 from envs_jax.base import Box, Discrete, Environment, EnvParams, StepResult
 from hrlspec.agent.agent import Agent
-from hrlspec.config import Config, CurriculumConfig, NetworkConfig, PPOConfig, RelabelConfig, ShieldConfig
+from hrlspec.agent.experience import View
+from hrlspec.agent.networks.planner import PlannerConfig
+from hrlspec.config import (
+    Config,
+    CurriculumConfig,
+    NetworkConfig,
+    OptimiserConfig,
+    PPOConfig,
+    ShieldConfig,
+    evolve,
+)
+from hrlspec.methods import ImplicitPlanner, Method, Ours
 from hrlspec.spec.tree import TaskTree
 from tests.trees import tree_of
 
@@ -118,33 +129,33 @@ class Corridor(Environment):
     def proposition_view(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
         return observation[:-1], observation[-1]
 
-    def view_at(self, position: Any) -> tuple[jax.Array, jax.Array]:
+    def view_at(self, position: Any) -> View:
         """The view from given cells (int, any leading axes)."""
         position = jnp.asarray(position)
         planes = jnp.broadcast_to(jnp.asarray(self.table.T, jnp.float32), (*position.shape, *self.table.T.shape))
-        return planes, jax.nn.one_hot(position, len(self.cells))
+        return View(planes, jax.nn.one_hot(position, len(self.cells)))
+
+
+_PPO = PPOConfig(
+    optimiser=OptimiserConfig(learning_rate=2e-3, final_learning_rate=0.0, epochs=4, minibatches=2),
+    entropy=0.05,
+    final_entropy=0.01,
+)
 
 
 def small_config(**changes: Any) -> Config:
     """Every technique on, as small as it goes; compiled programs are shared by tests that change nothing."""
-    ppo = PPOConfig(learning_rate=2e-3, final_learning_rate=0.0, epochs=4, minibatches=2)
     config = Config(
         num_envs=32,
         num_steps=24,
         total_steps=200 * 32 * 24,
         discount=0.9,
-        planner_share=4,
         group=8,
-        low=dataclasses.replace(ppo, entropy=0.05, final_entropy=0.01),
-        high=dataclasses.replace(ppo, entropy=0.05, final_entropy=0.01),
+        low=_PPO,
         network=NetworkConfig(
             latent=16,
             conv_channels=(),
             encoder_mlp=(32,),
-            planner_features=16,
-            planner_hidden=16,
-            planner_policy=(16,),
-            planner_rounds=0,
             task_features=8,
             task_rounds=0,
             actor=(32,),
@@ -153,10 +164,27 @@ def small_config(**changes: Any) -> Config:
             roles=True,
         ),
         curriculum=CurriculumConfig(levels=2, tasks_per_level=32, max_nodes=6, window=64),
-        relabel=RelabelConfig(planner_policy=False),
-        shield=ShieldConfig(minibatches=4),
+        shield=ShieldConfig(optimiser=evolve(ShieldConfig.optimiser, {"minibatches": 4})),
     )
     return dataclasses.replace(config, **changes)
+
+
+def small_planner(**changes: Any) -> ImplicitPlanner:
+    """As `small_config`, for the planner; changes by dotted names with ``__`` for dots."""
+    planner = ImplicitPlanner(
+        network=PlannerConfig(features=16, hidden=16, policy=(16,), rounds=0),
+        ppo=_PPO,
+        learns_from_copies=False,
+        steps_per_sample=4,
+    )
+    return evolve(planner, {name.replace("__", "."): value for name, value in changes.items()})
+
+
+def small_agent(
+    env: Environment, config: Config | None = None, method: Method | None = None, **planner: Any
+) -> Agent:
+    """An agent of the paper's method, or of another, with small settings."""
+    return Agent(env, config or small_config(), method or Ours(high=small_planner(**planner)))
 
 
 def quick_jit(function: Any, **options: Any) -> Any:

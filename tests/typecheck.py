@@ -19,13 +19,20 @@ from beartype import BeartypeConf, beartype
 from beartype.door import is_bearable
 
 PACKAGES = ("envs_jax", "hrlspec")
+CHECKED = (
+    "envs_jax",
+    *(f"hrlspec.{name}" for name in ("agent", "api", "evaluation", "exact", "learning", "methods", "tasks")),
+    # The rest of the language is text and syntax trees, whose own checks are tested with what is no such thing.
+    *(f"hrlspec.spec.{name}" for name in ("hashing", "monitor", "tree")),
+)
+"""Packages and modules that hold arrays."""
 
 checked = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
 
 def install() -> None:
     """Checks all that is imported of the packages from now on."""
-    jaxtyping.install_import_hook(list(PACKAGES), f"{__name__}.checked")
+    jaxtyping.install_import_hook(list(CHECKED), f"{__name__}.checked")
     flax.struct.dataclass = _checked_struct(flax.struct.dataclass)
 
 

@@ -105,7 +105,7 @@ def relabel(
     max_path: int,
     max_nodes: int,
     max_avoid: int,
-    branch: float,
+    branch: float | Float32[Array, ""],
 ) -> Relabelled:
     """Relabels one environment's rollout; ``vmap`` for more.
 
@@ -204,7 +204,7 @@ def _grow(
     *,
     max_nodes: int,
     max_avoid: int,
-    branch: float,
+    branch: float | Float32[Array, ""],
 ) -> TaskTree:
     """One tree around a completed path.
 

@@ -21,9 +21,9 @@ def low_level_targets(
     decided: Bool[Array, "T E"],
     high_value: Float32[Array, "T E"],
     *,
-    discount: float,
-    gae_lambda: float,
-    max_operator: bool,
+    discount: float | Float32[Array, ""],
+    gae_lambda: float | Float32[Array, ""],
+    max_operator: bool | Bool[Array, ""],
 ) -> Float32[Array, "T E"]:
     """λ-returns ``G_t = r_t + γ[(1−λ)V_{t+1} + λG_{t+1}]`` with the max operator (eq. 6).
 
@@ -72,8 +72,8 @@ def high_level_targets(
     value: Float32[Array, "T E"],
     bootstrap: Float32[Array, "T E"],
     *,
-    discount: float,
-    gae_lambda: float | Float32[Array, "T E"],
+    discount: float | Float32[Array, ""],
+    gae_lambda: float | Float32[Array, ""] | Float32[Array, "T E"],
 ) -> tuple[Float32[Array, "T E"], Float32[Array, "T E"]]:
     """SMDP generalised advantages of the high level's decisions.
 

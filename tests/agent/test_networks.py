@@ -16,10 +16,14 @@ import pytest
 
 import envs_jax
 from hrlspec.agent.agent import Agent
-from hrlspec.agent.networks.controller import TURNS, Instruction, turned
+from hrlspec.agent.distributions import MASKED
+from hrlspec.agent.experience import View
+from hrlspec.agent.networks.controller import Instruction
 from hrlspec.agent.networks.encoder import convolve
-from hrlspec.agent.networks.planner import MASKED
+from hrlspec.agent.networks.planner import Planner
+from hrlspec.agent.networks.symmetry import TURNS, turned
 from hrlspec.config import NetworkConfig
+from hrlspec.methods import LTL2ACTION, ImplicitPlanner, Ours
 from hrlspec.spec import TaskState, TaskTree, initial, open_edges
 from tests.probes import (
     Corridor,
@@ -29,7 +33,9 @@ from tests.probes import (
     random_order,
     random_params,
     reordered,
+    small_agent,
     small_config,
+    small_planner,
     subtree,
 )
 from tests.trees import random_tree, tree_of
@@ -42,12 +48,15 @@ VIEW = ENV.view_at(2)
 
 @functools.cache
 def setup(rounds: int, extras: bool = False) -> tuple[Agent, Any]:
-    network = small_config().network
-    network = dataclasses.replace(
-        network, planner_rounds=rounds, task_rounds=rounds, advice=extras, child_embeddings=extras
-    )
-    agent = Agent(ENV, small_config(network=network))
+    network = dataclasses.replace(small_config().network, task_rounds=rounds)
+    planner = {"network__rounds": rounds, "network__advice": float(extras), "network__child_embeddings": extras}
+    agent = small_agent(ENV, small_config(network=network), **planner)
     return agent, random_params(agent, 1)
+
+
+def planner_of(agent: Agent) -> Planner:
+    assert isinstance(agent.high, ImplicitPlanner)
+    return agent.high.planner(agent.low)
 
 
 @functools.cache
@@ -55,9 +64,9 @@ def compiled(rounds: int) -> tuple[Any, Any]:
     agent, params = setup(rounds)
 
     def plan(view: Any, tree: TaskTree, state: TaskState) -> Any:
-        return agent.planner.apply(params["planner"], view, tree, state, jnp.zeros(tree.num_nodes))
+        return planner_of(agent).apply(params["high"], view, tree, state, jnp.zeros(tree.num_nodes))
 
-    return quick_jit(plan), quick_jit(functools.partial(agent.instruct, params))
+    return quick_jit(plan), quick_jit(functools.partial(agent.low.instruct, params))
 
 
 def plan(rounds: int, tree: TaskTree, *, node: int = 0, blocked: tuple[int, ...] = (), view: Any = VIEW) -> Any:
@@ -191,10 +200,10 @@ def test_the_sweep_looks_ahead_without_limit_and_rounds_as_far_as_they_reach() -
 
 def test_what_the_rounds_hand_on_does_not_grow_with_the_weights() -> None:
     agent, params = setup(3)
-    large = jax.tree.map(lambda weights: 30 * weights, params["planner"])
+    large = jax.tree.map(lambda weights: 30 * weights, params["high"])
     tree = on_device(some_trees(1)[0])
     latents = jax.random.normal(jax.random.key(0), (tree.num_nodes, agent.config.network.latent))
-    nodes = np.asarray(agent.planner.apply(large, latents, tree, initial(tree), method="embed"))
+    nodes = np.asarray(planner_of(agent).apply(large, latents, tree, initial(tree), method="embed"))
     np.testing.assert_allclose(np.sqrt((nodes**2).mean(-1)), 1.0, atol=1e-2)
     np.testing.assert_allclose(nodes.mean(-1), 0.0, atol=1e-5)
 
@@ -203,10 +212,10 @@ def test_one_round_equals_the_sweep_where_nothing_is_below() -> None:
     """Rounds update a node from itself again and again, the sweep once: they agree on leaves after one round."""
     agent, params = setup(0)
     network = dataclasses.replace(agent.config.network, task_rounds=1)
-    one = Agent(ENV, dataclasses.replace(agent.config, network=network))
+    one = small_agent(ENV, dataclasses.replace(agent.config, network=network))
     tree = on_device(some_trees(1)[0])
     leaves = np.asarray(tree.accepting)
-    swept, once = agent.instruct(params, tree).future, one.instruct(params, tree).future
+    swept, once = agent.low.instruct(params, tree).future, one.low.instruct(params, tree).future
     np.testing.assert_allclose(np.asarray(swept)[leaves], np.asarray(once)[leaves], atol=1e-6)
 
 
@@ -218,20 +227,22 @@ def test_gradients_are_finite(rounds: int, extras: bool) -> None:
     accepting = jnp.argmax(trees.accepting, -1)
 
     def loss(params: Any) -> jax.Array:
-        book = agent.open_book(params, trees)
+        book = agent.low.open_book(params, trees)
         total = jnp.float32(0)
         for node in (jnp.zeros(4, jnp.int32), accepting):
             state = jax.vmap(initial)(trees).replace(node=node)
 
-            def one(tree: TaskTree, state: TaskState, told: Instruction) -> jax.Array:
-                logits, value = agent.plan(params, VIEW, tree, state, told)
-                scores = jax.nn.log_softmax(logits)
-                actions, own = agent.control(params, VIEW, jax.tree.map(lambda x: x[1], told))
-                open_scores = jnp.where(open_edges(tree, state), scores, 0.0).sum()
-                return open_scores + value + jax.nn.log_softmax(actions)[0] + own
+            views = jax.tree.map(lambda x: jnp.stack([x] * 4), VIEW)
+            choice = agent.high.choose(agent.low, params, views, trees, state, book.told)
+            scores = jax.nn.log_softmax(choice.logits)
+            total += jnp.where(jax.vmap(open_edges)(trees, state), scores, 0.0).sum() + choice.value.sum()
 
-            total += jax.vmap(one)(trees, state, book.told).sum()
-        return total + agent.reach_values(params, VIEW).sum()
+            def one(told: Instruction) -> jax.Array:
+                actions, own = agent.low.control(params, VIEW, jax.tree.map(lambda x: x[1], told))
+                return jax.nn.log_softmax(actions)[0] + own
+
+            total += jax.vmap(one)(book.told).sum()
+        return total + agent.low.reach_values(params, VIEW).sum()
 
     value, gradient = quick_jit(jax.value_and_grad(loss))(params)
     assert np.isfinite(value)
@@ -275,23 +286,28 @@ def test_convolutions_and_their_batches() -> None:
 
 def test_the_reach_critic_answers_in_the_unit_interval_for_each_goal() -> None:
     agent, params = setup(0)
-    values = np.asarray(agent.reach_values(params, VIEW))
+    values = np.asarray(agent.low.reach_values(params, VIEW))
     assert values.shape == (4, 2)
     assert ((values > 0) & (values < 1)).all()
 
 
 def instruction(rows: np.ndarray, network: NetworkConfig) -> Instruction:
     """To reach the first of the propositions (rows ``[R, P]``), avoid the second, and go on with the others."""
-    future = np.zeros(network.task_features)
+    future = np.zeros(network.task_features, np.float32)
     return Instruction(reach=rows[0], avoid=rows[1], ahead=rows[2:], behind=rows[:0], future=future)
 
 
 @pytest.mark.parametrize("whole_task", [False, True])
 def test_a_scaled_task_is_a_task_with_larger_weights(whole_task: bool) -> None:
     """What is scaled is the sub-task, and the whole task where there is no sub-task, but not what comes later."""
-    network = dataclasses.replace(small_config().network, advice=0.0, roles=False, whole_task=whole_task)
+    network = dataclasses.replace(small_config().network, roles=False)
     plain, scaled = (
-        Agent(ENV, small_config(network=dataclasses.replace(network, task_scale=scale))) for scale in (1.0, 4.0)
+        small_agent(
+            ENV,
+            small_config(network=dataclasses.replace(network, task_scale=scale)),
+            LTL2ACTION if whole_task else Ours(high=small_planner()),
+        )
+        for scale in (1.0, 4.0)
     )
     params = random_params(plain, 3)
     rows = slice(network.latent, None if whole_task else -network.task_features)
@@ -302,10 +318,10 @@ def test_a_scaled_task_is_a_task_with_larger_weights(whole_task: bool) -> None:
 
     heads = ("actor", "critic")
     told = instruction(np.eye(ENV.num_propositions, dtype=np.float32)[:2], network)
-    told = told.replace(future=np.linspace(-1, 1, network.task_features))
-    heard = {**params, "controller": jax.tree_util.tree_map_with_path(louder, params["controller"])}
-    before, after = plain.control(params, VIEW, told), scaled.control(params, VIEW, told)
-    for a, b, old in zip(after, plain.control(heard, VIEW, told), before, strict=True):
+    told = told.replace(future=np.linspace(-1, 1, network.task_features, dtype=np.float32))
+    heard = {**params, "low": jax.tree_util.tree_map_with_path(louder, params["low"])}
+    before, after = plain.low.control(params, VIEW, told), scaled.low.control(params, VIEW, told)
+    for a, b, old in zip(after, plain.low.control(heard, VIEW, told), before, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
         assert np.abs(np.asarray(a - old)).max() > 1e-3
 
@@ -314,12 +330,12 @@ def test_the_low_level_turns_with_the_world() -> None:
     """Seen through any of the eight turns, it acts as before, turned, and values what it sees alike."""
     env = envs_jax.make("letter")
     network = dataclasses.replace(small_config().network, lookahead=3, symmetric=True)
-    agent, turns = Agent(env, small_config(network=network)), env.symmetries
+    agent, turns = small_agent(env, small_config(network=network)), env.symmetries
     assert turns is not None
     params = random_params(agent, 3)
     letters = np.eye(env.num_propositions, dtype=np.float32)
     told = instruction(letters, network)
-    control = quick_jit(lambda view: agent.control(params, view, told))
+    control = quick_jit(lambda view: agent.low.control(params, View(*view), told))
     straight = 0
     for seed in range(10):
         observation, _ = env.reset(jax.random.key(seed), env.default_params)
@@ -337,11 +353,11 @@ def test_the_low_level_is_reflected_with_the_world() -> None:
     """Seen in any of the four mirrors, its actions are reflected likewise, and it values what it sees alike."""
     env = envs_jax.make("zone", physics="closed-form")
     network = dataclasses.replace(small_config().network, lookahead=2, symmetric=True)
-    agent, mirrors = Agent(env, small_config(network=network)), env.symmetries
+    agent, mirrors = small_agent(env, small_config(network=network)), env.symmetries
     params = random_params(agent, 3)
     colours = np.eye(4, dtype=np.float32)
     told = instruction(colours, network)
-    control = quick_jit(lambda view: agent.control(params, view, told))
+    control = quick_jit(lambda view: agent.low.control(params, View(*view), told))
     rng = np.random.default_rng(0)
     actions = set()
     for _ in range(10):

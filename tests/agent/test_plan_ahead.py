@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hrlspec.agent.agent import Agent
 from hrlspec.agent.networks.tree import lookahead, lookback, routes
+from hrlspec.methods import Ours
 from hrlspec.spec import TaskTree, advance, initial, open_edges
-from tests.probes import Corridor, on_device, quick_jit, random_params, small_config
+from tests.probes import Corridor, on_device, quick_jit, random_params, small_agent, small_config, small_planner
 from tests.trees import random_tree
 
 ENV = Corridor()
@@ -76,28 +76,28 @@ def test_the_low_level_remembers_as_much_as_it_is_told_to() -> None:
     )
     for memory in (0, 1):
         network = dataclasses.replace(small_config().network, roles=True, memory=memory)
-        agent = Agent(ENV, small_config(network=network))
+        agent = small_agent(ENV, small_config(network=network))
         params = random_params(agent, 4)
-        told = agent.instruct(params, tree)
+        told = agent.low.instruct(params, tree)
         last = [jax.tree.map(lambda x, e=edge: x[e], told) for edge in (3, 4)]
-        values = [float(agent.control(params, ENV.view_at(2), some)[1]) for some in last]
+        values = [float(agent.low.control(params, ENV.view_at(2), some)[1]) for some in last]
         assert (abs(values[0] - values[1]) > 1e-3) == bool(memory)
 
 
 def test_advice_is_the_value_of_the_best_way_and_that_way_is_handed_down() -> None:
-    base = small_config().network
-    network = dataclasses.replace(base, roles=True, lookahead=LENGTH, advice=10.0, advised=12)
-    agent = Agent(ENV, small_config(network=network))
+    network = dataclasses.replace(small_config().network, roles=True, lookahead=LENGTH)
+    planner = small_planner(network__advice=10.0)
+    agent = small_agent(ENV, small_config(network=network), Ours(high=planner))
     params, view = random_params(agent, 2), ENV.view_at(2)
-    control = quick_jit(lambda told: agent.control(params, view, told)[1])
-    advise = quick_jit(lambda *batch: agent.advise(params, *batch))
+    control = quick_jit(lambda told: agent.low.control(params, view, told)[1])
+    advise = quick_jit(lambda *batch: planner.advise(agent.low, params, *batch))
     rng = np.random.default_rng(2)
     several = 0
     for _ in range(20):
         tree = on_device(random_tree(rng, num_nodes=9, num_propositions=ENV.num_propositions, distinct=True))
         labels = jnp.asarray(rng.random(ENV.num_propositions) < 0.4)
         state = advance(tree, initial(tree), labels, TaskTree.NO_NODE)
-        told = agent.instruct(params, tree)
+        told = agent.low.instruct(params, tree)
         batch = jax.tree.map(lambda x: x[None], (view, tree, state, told))
         advice, ahead = jax.tree.map(lambda x: x[0], advise(*batch))
         for edge in np.flatnonzero(open_edges(tree, state)):

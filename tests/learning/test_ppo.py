@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hrlspec.config import PPOConfig
+from hrlspec.config import OptimiserConfig, PPOConfig
 from hrlspec.learning import ppo
+from hrlspec.learning.optimiser import annealed, gradient_step, optimiser
 
 SETTINGS = PPOConfig(clip=0.2)
 
@@ -33,9 +34,9 @@ def test_normalise_uses_the_masked_samples_alone() -> None:
 
 def test_relative_advantages_count_per_unit_of_what_was_expected() -> None:
     advantage, value = jnp.array([1.0, -1.0, 10.0]), jnp.array([0.5, -1.5, 9.5])
-    scaled = ppo.relative(advantage, value, PPOConfig(relative=0.5))
+    scaled = ppo.scaled(advantage, value, PPOConfig(advantage_scale=0.5))
     np.testing.assert_allclose(scaled, [1.0, -0.5, 1.0], rtol=1e-6)
-    np.testing.assert_array_equal(ppo.relative(advantage, value, PPOConfig()), advantage)
+    np.testing.assert_array_equal(ppo.scaled(advantage, value, PPOConfig()), advantage)
 
 
 def test_policy_loss_equals_a_plain_reading() -> None:
@@ -64,7 +65,7 @@ def test_policy_gradient_stops_where_the_step_is_long_enough(shift: float, advan
 @pytest.mark.parametrize(("shift", "advantage", "moves"), [(2, -1, 0), (1, -1, 1), (-2, 1, 1), (2, 1, 0)])
 def test_what_became_much_likelier_counts_no_more(shift: float, advantage: float, moves: int) -> None:
     """At most e^1.5 times as likely: beyond, a negative advantage has no gradient either."""
-    settings = PPOConfig(most_ratio=float(np.exp(1.5)))
+    settings = PPOConfig(dual_clip=float(np.exp(1.5)))
 
     def loss(x: jax.Array) -> jax.Array:
         return ppo.policy_loss(x[None], jnp.zeros(1), jnp.full(1, float(advantage)), jnp.ones(1, bool), settings)
@@ -84,7 +85,7 @@ def test_masked_samples_with_senseless_log_probabilities_do_no_harm() -> None:
 
 def test_annealing() -> None:
     for progress, value in ((0, 1.0), (0.5, 0.75), (1, 0.5), (3, 0.5)):
-        assert float(ppo.annealed(1.0, 0.5, jnp.float32(progress))) == pytest.approx(value)
+        assert float(annealed(1.0, 0.5, jnp.float32(progress))) == pytest.approx(value)
 
 
 def test_entropy_weighs_more_the_more_of_it_is_missing() -> None:
@@ -104,8 +105,8 @@ def test_entropy_weighs_more_the_more_of_it_is_missing() -> None:
 
 
 def step(loss: Any, params: Any, clip: float = 1.0) -> Any:
-    transform = ppo.optimiser(clip)
-    return ppo.gradient_step(loss, params, transform.init(params), transform, jnp.float32(0.1))
+    transform = optimiser(OptimiserConfig(max_grad_norm=clip))
+    return gradient_step(loss, params, transform.init(params), transform, jnp.float32(0.1))
 
 
 def test_gradient_step_descends() -> None:
@@ -127,9 +128,9 @@ def test_a_step_that_is_not_finite_changes_nothing(bad: float, where: str) -> No
         return jnp.where(p > 0, p, 0.0).sum() + bad * (p - jax.lax.stop_gradient(p)).sum(), {}
 
     params = jnp.array([1.0, 2.0])
-    transform = ppo.optimiser(1.0)
+    transform = optimiser(OptimiserConfig(max_grad_norm=1.0))
     state = transform.init(params)
-    new, new_state, metrics = ppo.gradient_step(loss, params, state, transform, jnp.float32(0.1))
+    new, new_state, metrics = gradient_step(loss, params, state, transform, jnp.float32(0.1))
     assert float(metrics["skipped"]) == 1
     for a, b in zip(jax.tree.leaves((params, state)), jax.tree.leaves((new, new_state)), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -12,31 +12,44 @@ import numpy as np
 import pytest
 
 import envs_jax
-from hrlspec.agent.agent import Agent, TaskBook
-from hrlspec.agent.interaction import decide, start
-from hrlspec.config import CurriculumConfig, RelabelConfig, ShieldConfig
-from hrlspec.learning.batch import LowBatch, PlanBatch, build, plan_state
-from hrlspec.learning.rollout import Collector, Trajectory, collect, fill_pool
+from hrlspec.agent.agent import Agent
+from hrlspec.agent.experience import HighBatch, LowBatch, Step
+from hrlspec.agent.interaction import assign, start
+from hrlspec.agent.low_level import TaskBook
+from hrlspec.config import CurriculumConfig, RelabelConfig, evolve
+from hrlspec.learning.batch import high_batch, low_batch
+from hrlspec.learning.experience import gather
+from hrlspec.learning.rollout import Collector, Setting, collect, fill_pool
 from hrlspec.learning.train import Trainer
+from hrlspec.methods import Ours
 from hrlspec.spec import TaskState, TaskTree
 from hrlspec.tasks.curriculum import draw_bank
 from hrlspec.tasks.rewards import Bonus, RewardMachine, reward_machine
 from tests.agent.test_agent import read_shield
 from tests.learning.test_targets import low_reference, plan_reference
-from tests.probes import Corridor, on_device, pairs, quick_jit, random_params, read_monitor, small_config
+from tests.probes import (
+    Corridor,
+    on_device,
+    pairs,
+    quick_jit,
+    random_params,
+    read_monitor,
+    small_agent,
+    small_config,
+    small_planner,
+)
 from tests.tasks.test_rewards import reference as read_rewards
 
 # Letters everywhere, two of them together, and a short horizon: many episodes that end in every way.
 ENV = Corridor(cells=("a", "", "bc", "", "d", "", ""), starts=(1, 3, 5), horizon=9)
 CONFIG = small_config(
-    network=dataclasses.replace(small_config().network, advice=1.0, advised=3),
     num_steps=48,
     curriculum=CurriculumConfig(levels=3, tasks_per_level=32, max_nodes=8, tree_share=0.5),
-    shield=ShieldConfig(threshold=0.6),
+    shield=evolve(small_config().shield, {"threshold": 0.6}),
     relabel=RelabelConfig(share=1.0, corrected=False),
-    unfinished=True,
 )
-AGENT = Agent(ENV, CONFIG)
+PLANNER = small_planner(network__advice=1.0, advised=3, learns_unfinished=True)
+AGENT = Agent(ENV, CONFIG, Ours(high=PLANNER))
 E, T = CONFIG.num_envs, CONFIG.num_steps
 RULES = [Bonus("a", "d", 5.0), Bonus("b", "d", 10.0, ("a",))]
 LEVEL = 2
@@ -45,30 +58,37 @@ LEVEL = 2
 class Rollout(NamedTuple):
     """One rollout; ``carried`` says which decisions were made at the end of the one before."""
 
-    trajectory: Trajectory
+    trajectory: Step
     low: LowBatch
-    plan: PlanBatch
+    plan: HighBatch
     after: Collector
 
 
 @quick_jit
 def prepare(params: Any, bank: TaskTree, key: jax.Array) -> tuple[TaskBook, Collector]:
     tasks = jax.tree.map(lambda x: x[:E], bank)
-    book = AGENT.open_book(params, jax.tree.map(lambda *x: jnp.concatenate(x), tasks, bank))
+    book = AGENT.low.open_book(params, jax.tree.map(lambda *x: jnp.concatenate(x), tasks, bank))
     layouts = jax.vmap(ENV.sample_layout, (0, None))(jax.random.split(key, E), ENV.default_params)
-    worker = start(AGENT, machine(), layouts, jnp.arange(E), jax.random.split(key, E), book)
-    worker, decision = decide(AGENT, params, book, worker, jnp.zeros((E, 8)))
+    worker = start(jax.random.split(key, E), ENV, machine(), book, layouts, jnp.arange(E))
+    worker = assign(AGENT, params, book, worker, jnp.zeros((E, 8)))
     zeros = jnp.zeros(E, jnp.int32)
-    return book, Collector(worker=worker, decision=decision, level=zeros, started=zeros, since=zeros)
+    return book, Collector(worker=worker, level=zeros, started=zeros, since=zeros)
+
+
+def batches(agent: Agent, key: jax.Array, params: Any, book: TaskBook, steps: Step) -> tuple[LowBatch, HighBatch]:
+    """What an iteration learns from."""
+    relabel_key, pick_key = jax.random.split(key)
+    experience = gather(relabel_key, agent, params, machine(), book, steps, jnp.zeros(1, jnp.uint32))
+    assert agent.high.ppo is not None
+    return low_batch(agent, experience), high_batch(pick_key, agent, experience, agent.high.ppo)
 
 
 @quick_jit
 def roll(params: Any, book: TaskBook, collector: Collector, key: jax.Array) -> Rollout:
     keys = jax.random.split(key, 3)
     pool = fill_pool(keys[0], AGENT, book, jnp.int32(LEVEL), size=12)
-    after, trajectory = collect(keys[1], AGENT, params, machine(), book, collector, pool, 0.0)
-    low, plan = build(keys[2], AGENT, params, machine(), book, trajectory, jnp.zeros(1, jnp.uint32))
-    return Rollout(trajectory, low, plan, after)
+    after, trajectory = collect(keys[1], Setting(AGENT, params, machine(), book, pool), collector, 0.0)
+    return Rollout(trajectory, *batches(AGENT, keys[2], params, book, trajectory), after)
 
 
 def machine() -> RewardMachine:
@@ -96,7 +116,7 @@ def book() -> TaskBook:
 
 
 @pytest.fixture
-def t() -> Trajectory:
+def t() -> Step:
     return rollouts()[2].trajectory
 
 
@@ -108,31 +128,31 @@ def position(view: Any) -> np.ndarray:
     return view[1].argmax(-1)
 
 
-def test_the_sample_is_rich(t: Trajectory) -> None:
-    assert t.terminated.sum() > 10
-    assert t.truncated.sum() > 5
-    assert t.satisfied.sum() > 5
-    assert (t.terminated & ~t.satisfied).any()
-    assert t.shielded.sum() > 5
-    assert t.shielded.mean() < 0.5
-    assert (t.labels.sum(-1) > 1).any()
-    assert t.blocked.any()
-    assert rollouts()[1].trajectory.reward.max() >= 5
-    assert t.decided[0].any()
-    assert not t.decided[0].all()
+def test_the_sample_is_rich(t: Step) -> None:
+    assert t.outcome.terminated.sum() > 10
+    assert t.outcome.truncated.sum() > 5
+    assert t.outcome.satisfied.sum() > 5
+    assert (t.outcome.terminated & ~t.outcome.satisfied).any()
+    assert t.low.shielded.sum() > 5
+    assert t.low.shielded.mean() < 0.5
+    assert (t.outcome.labels.sum(-1) > 1).any()
+    assert t.state.blocked.any()
+    assert rollouts()[1].trajectory.outcome.reward.max() >= 5
+    assert t.high.made[0].any()
+    assert not t.high.made[0].all()
     assert set(t.level.ravel()) == {0, 1, 2}
 
 
-def test_the_world_moves_as_it_says(t: Trajectory) -> None:
+def test_the_world_moves_as_it_says(t: Step) -> None:
     here = position(t.view)
-    there = np.clip(here + 2 * t.action - 1, 0, len(ENV.cells) - 1)
-    np.testing.assert_array_equal(t.labels, ENV.table[there])
-    ended = t.terminated | t.truncated
+    there = np.clip(here + 2 * t.low.action - 1, 0, len(ENV.cells) - 1)
+    np.testing.assert_array_equal(t.outcome.labels, ENV.table[there])
+    ended = t.outcome.terminated | t.outcome.truncated
     going_on = ~ended[:-1]
     np.testing.assert_array_equal(here[1:][going_on], there[:-1][going_on])
     assert np.isin(here[1:][~going_on], ENV.starts).all()
     assert len(set(here[1:][~going_on])) == 3
-    assert not (t.terminated & t.truncated).any()
+    assert not (t.outcome.terminated & t.outcome.truncated).any()
     np.testing.assert_array_equal(t.episode, np.cumsum(ended, 0) - ended)
 
 
@@ -145,8 +165,8 @@ def test_episodes_last_no_longer_than_the_horizon() -> None:
         for step in range(2 * T):
             length += 1
             assert length <= ENV.horizon
-            assert both.truncated[step, e] == (length == ENV.horizon and not both.terminated[step, e])
-            if both.terminated[step, e] or both.truncated[step, e]:
+            assert both.outcome.truncated[step, e] == (length == ENV.horizon and not both.outcome.terminated[step, e])
+            if both.outcome.terminated[step, e] or both.outcome.truncated[step, e]:
                 length = 0
 
 
@@ -162,20 +182,20 @@ def test_labels_replay_through_the_monitor() -> None:
                 task, node, blocked = both.task[s, e], 0, set()
                 assert task < E if s == 0 else (task - E) // 32 == both.level[s, e]
             steps.append(s)
-            assert (both.task[s, e], both.node[s, e], pairs(both.blocked[s, e])) == (task, node, blocked)
+            assert (both.task[s, e], both.state.node[s, e], pairs(both.state.blocked[s, e])) == (task, node, blocked)
             tree = tree_of_row(book, task)
-            assert tree.parent[both.assigned[s, e]] == node
-            assert both.assigned[s, e] not in blocked
+            assert tree.parent[both.high.edge[s, e]] == node
+            assert both.high.edge[s, e] not in blocked
             before = node
-            node, blocked, status = read_monitor(tree, node, blocked, pairs(both.labels[s, e]), both.assigned[s, e])
-            assert (both.edge[s, e], both.edge_taken[s, e]) == (node, node != before)
-            assert both.satisfied[s, e] == (status == "satisfied")
-            assert both.terminated[s, e] == (status != "running")
-            if both.terminated[s, e] or both.truncated[s, e]:
-                reached = tree.reach[both.edge[steps, e]]
-                taken, done = both.edge_taken[steps, e], both.satisfied[steps, e]
-                expected = read_rewards(RULES, 1.0, 0.5, both.labels[steps, e], reached, taken, done)
-                np.testing.assert_allclose(both.reward[steps, e], expected)
+            node, blocked, status = read_monitor(tree, node, blocked, pairs(both.outcome.labels[s, e]), both.high.edge[s, e])
+            assert (both.outcome.node[s, e], both.outcome.edge_taken[s, e]) == (node, node != before)
+            assert both.outcome.satisfied[s, e] == (status == "satisfied")
+            assert both.outcome.terminated[s, e] == (status != "running")
+            if both.outcome.terminated[s, e] or both.outcome.truncated[s, e]:
+                reached = tree.reach[both.outcome.node[steps, e]]
+                taken, done = both.outcome.edge_taken[steps, e], both.outcome.satisfied[steps, e]
+                expected = read_rewards(RULES, 1.0, 0.5, both.outcome.labels[steps, e], reached, taken, done)
+                np.testing.assert_allclose(both.outcome.reward[steps, e], expected)
                 steps = []
 
 
@@ -185,23 +205,23 @@ def test_decisions_where_they_are_due_and_only_there() -> None:
     due = np.ones((2 * T, E), bool)
     for s in range(1, 2 * T):
         for e in range(E):
-            ended = both.terminated[s - 1, e] or both.truncated[s - 1, e]
-            lost = not both.edge_taken[s - 1, e] and bool(
-                book.tree.avoid[both.task[s - 1, e], both.assigned[s - 1, e]] @ both.labels[s - 1, e]
+            ended = both.outcome.terminated[s - 1, e] or both.outcome.truncated[s - 1, e]
+            lost = not both.outcome.edge_taken[s - 1, e] and bool(
+                book.tree.avoid[both.task[s - 1, e], both.high.edge[s - 1, e]] @ both.outcome.labels[s - 1, e]
             )
-            due[s, e] = ended or both.edge_taken[s - 1, e] or lost
+            due[s, e] = ended or both.outcome.edge_taken[s - 1, e] or lost
             if not due[s, e]:
-                assert both.assigned[s, e] == both.assigned[s - 1, e]
+                assert both.high.edge[s, e] == both.high.edge[s - 1, e]
             assert both.since[s, e] == (0 if due[s, e] else both.since[s - 1, e] + 1)
-    np.testing.assert_array_equal(both.decided, due)
+    np.testing.assert_array_equal(both.high.made, due)
     assert 0.1 < due.mean() < 0.9
 
 
-def test_what_lies_ahead_is_a_way_to_a_leaf(book: TaskBook, t: Trajectory) -> None:
+def test_what_lies_ahead_is_a_way_to_a_leaf(book: TaskBook, t: Step) -> None:
     """Or, of an edge that was not advised on, everything that lies ahead; and it stays until the next decision."""
     plans = 0
     for s, e in np.ndindex(T, E):
-        tree, edge = tree_of_row(book, t.task[s, e]), t.assigned[s, e]
+        tree, edge = tree_of_row(book, t.task[s, e]), t.high.edge[s, e]
         ways = []
         for leaf in np.flatnonzero(tree.accepting):
             way = [leaf]
@@ -210,10 +230,10 @@ def test_what_lies_ahead_is_a_way_to_a_leaf(book: TaskBook, t: Trajectory) -> No
             if way[0] == edge:
                 ways.append(np.array([*tree.reach[way[1:3]], *np.zeros((2, 4), bool)])[:2])
         everything = np.asarray(book.told.ahead[t.task[s, e], edge], bool)
-        assert any((t.ahead[s, e] == way).all() for way in [*ways, everything])
-        plans += not (t.ahead[s, e] == everything).all()
-        if s and not t.decided[s, e]:
-            np.testing.assert_array_equal(t.ahead[s, e], t.ahead[s - 1, e])
+        assert any((t.high.ahead[s, e] == way).all() for way in [*ways, everything])
+        plans += not (t.high.ahead[s, e] == everything).all()
+        if s and not t.high.made[s, e]:
+            np.testing.assert_array_equal(t.high.ahead[s, e], t.high.ahead[s - 1, e])
     assert plans > 0
 
 
@@ -223,112 +243,114 @@ def flat(x: Any) -> Any:
 
 @quick_jit
 def control(params: Any, view: Any, told: Any) -> Any:
-    return jax.vmap(AGENT.control, (None, 0, 0))(params, view, told)
+    return jax.vmap(AGENT.low.control, (None, 0, 0))(params, view, told)
 
 
 @quick_jit
 def plan_all(params: Any, view: Any, tree: TaskTree, state: TaskState) -> Any:
-    told = jax.vmap(AGENT.instruct, (None, 0))(params, tree)
-    return jax.vmap(AGENT.plan, (None, 0, 0, 0, 0))(params, view, tree, state, told)
+    told = jax.vmap(AGENT.low.instruct, (None, 0))(params, tree)
+    choice = AGENT.high.choose(AGENT.low, params, view, tree, state, told)
+    return choice.logits, choice.value
 
 
 def log_probs(logits: Any, choice: np.ndarray) -> np.ndarray:
     return np.take_along_axis(np.asarray(jax.nn.log_softmax(logits)), choice[:, None], 1)[:, 0]
 
 
-def test_actions_values_and_the_shield(book: TaskBook, t: Trajectory) -> None:
-    told = jax.tree.map(lambda x: x[t.task.ravel(), t.assigned.ravel()], book.told)
-    told = dataclasses.replace(told, ahead=flat(t.ahead))
+def test_actions_values_and_the_shield(book: TaskBook, t: Step) -> None:
+    told = jax.tree.map(lambda x: x[t.task.ravel(), t.high.edge.ravel()], book.told)
+    told = dataclasses.replace(told, ahead=flat(t.high.ahead))
     logits, value = control(params(), flat(t.view), told)
-    own = ~t.shielded.ravel()
-    np.testing.assert_allclose(t.log_prob.ravel()[own], log_probs(logits, t.action.ravel())[own], atol=1e-5)
-    np.testing.assert_allclose(t.value.ravel(), value, atol=1e-5)
-    q = np.asarray(quick_jit(jax.vmap(AGENT.reach_values, (None, 0)))(params(), flat(t.view)))
+    own = ~t.low.shielded.ravel()
+    np.testing.assert_allclose(t.low.log_prob.ravel()[own], log_probs(logits, t.low.action.ravel())[own], atol=1e-5)
+    np.testing.assert_allclose(t.low.value.ravel(), value, atol=1e-5)
+    q = np.asarray(quick_jit(jax.vmap(AGENT.low.reach_values, (None, 0)))(params(), flat(t.view)))
     for i in range(T * E):
-        forbidden, action = pairs(told.avoid[i]), int(t.action.ravel()[i])
-        shielded = t.shielded.ravel()[i]
+        forbidden, action = pairs(told.avoid[i]), int(t.low.action.ravel()[i])
+        shielded = t.low.shielded.ravel()[i]
         # Of two actions the shield replaced the other one; an action that stands is one that the rule lets stand.
         meant = 1 - action if shielded else action
-        assert read_shield("state", CONFIG.shield.threshold, q[i], forbidden, meant) == action
+        assert read_shield(CONFIG.shield.threshold, q[i], forbidden, meant) == action
         if shielded:
             np.testing.assert_allclose(
-                t.log_prob.ravel()[i], log_probs(logits[i][None], np.array([meant]))[0], atol=1e-5
+                t.low.log_prob.ravel()[i], log_probs(logits[i][None], np.array([meant]))[0], atol=1e-5
             )
 
 
-def test_reach_values_are_of_the_state_after_the_step(t: Trajectory) -> None:
+def test_reach_values_are_of_the_state_after_the_step(t: Step) -> None:
     """Also where the episode ended there, and the next one's first state is what is seen next."""
-    value = np.asarray(quick_jit(jax.vmap(AGENT.reach_values, (None, 0)))(params(), flat(t.view))).max(-1)
+    value = np.asarray(quick_jit(jax.vmap(AGENT.low.reach_values, (None, 0)))(params(), flat(t.view))).max(-1)
     value = value.reshape(T, E, -1)
-    goes_on = ~(t.terminated | t.truncated)[:-1]
+    goes_on = ~(t.outcome.terminated | t.outcome.truncated)[:-1]
     np.testing.assert_allclose(t.reach_value[:-1][goes_on], value[1:][goes_on], atol=1e-5)
     assert (np.abs(t.reach_value[:-1] - value[1:])[~goes_on] > 1e-3).any()
 
 
-def states(t: Trajectory, node: np.ndarray, blocked: np.ndarray) -> TaskState:
+def states(t: Step, node: np.ndarray, blocked: np.ndarray) -> TaskState:
     return TaskState(node=node.ravel(), blocked=blocked.reshape(T * E, -1), status=np.zeros(T * E, np.int32))
 
 
-def test_decisions_log_probabilities_and_values(book: TaskBook, t: Trajectory) -> None:
+def test_decisions_log_probabilities_and_values(book: TaskBook, t: Step) -> None:
     trees = jax.tree.map(lambda x: x[t.task.ravel()], book.tree)
-    logits, value = plan_all(params(), flat(t.view), trees, states(t, t.node, t.blocked))
-    made = t.decided.ravel()
-    expected = log_probs(logits, t.assigned.ravel())[made]
-    np.testing.assert_allclose(t.plan_log_prob.ravel()[made], expected, atol=1e-5)
-    np.testing.assert_allclose(t.plan_value.ravel()[made], np.asarray(value)[made], atol=1e-5)
+    logits, value = plan_all(params(), flat(t.view), trees, states(t, t.state.node, t.state.blocked))
+    made = t.high.made.ravel()
+    expected = log_probs(logits, t.high.edge.ravel())[made]
+    np.testing.assert_allclose(t.high.log_prob.ravel()[made], expected, atol=1e-5)
+    np.testing.assert_allclose(t.high.value.ravel()[made], np.asarray(value)[made], atol=1e-5)
     assert (expected < -0.1).sum() > 10  # there were choices
 
 
-def test_cut_episodes_bootstrap_with_the_state_they_were_cut_in(book: TaskBook, t: Trajectory) -> None:
+def test_cut_episodes_bootstrap_with_the_state_they_were_cut_in(book: TaskBook, t: Step) -> None:
     """Truncated ones and the rollout's last step: the value of what would have come next, not of the next episode."""
     trees = jax.tree.map(lambda x: x[t.task.ravel()], book.tree)
-    there = np.clip(position(t.view) + 2 * t.action - 1, 0, len(ENV.cells) - 1)
-    blocked = np.zeros_like(t.blocked)
+    there = np.clip(position(t.view) + 2 * t.low.action - 1, 0, len(ENV.cells) - 1)
+    blocked = np.zeros_like(t.state.blocked)
     for s, e in np.ndindex(T, E):
         tree = tree_of_row(book, t.task[s, e])
-        arguments = int(t.node[s, e]), pairs(t.blocked[s, e]), pairs(t.labels[s, e]), int(t.assigned[s, e])
+        arguments = int(t.state.node[s, e]), pairs(t.state.blocked[s, e]), pairs(t.outcome.labels[s, e]), int(t.high.edge[s, e])
         blocked[s, e, list(read_monitor(tree, *arguments)[1])] = True
-    _, value = plan_all(params(), flat(jax.tree.map(np.asarray, ENV.view_at(there))), trees, states(t, t.edge, blocked))
+    _, value = plan_all(params(), flat(jax.tree.map(np.asarray, ENV.view_at(there))), trees, states(t, t.outcome.node, blocked))
     value = np.asarray(value).reshape(T, E)
-    for bootstrap in (t.bootstrap, t.plan_bootstrap):
-        np.testing.assert_allclose(bootstrap[t.truncated], value[t.truncated], atol=1e-5)
-    going_on = ~(t.terminated | t.truncated)[-1]
+    for bootstrap in (t.bootstrap.low, t.bootstrap.high):
+        np.testing.assert_allclose(bootstrap[t.outcome.truncated], value[t.outcome.truncated], atol=1e-5)
+    going_on = ~(t.outcome.terminated | t.outcome.truncated)[-1]
     assert going_on.sum() > 5
-    np.testing.assert_allclose(t.plan_bootstrap[-1][going_on], value[-1][going_on], atol=1e-5)
+    np.testing.assert_allclose(t.bootstrap.high[-1][going_on], value[-1][going_on], atol=1e-5)
     after = rollouts()[2].after.worker
-    told = jax.tree.map(lambda x: x[after.task, after.assigned], book.told)
-    told = jax.tree.map(lambda x: np.repeat(x, T, 0), dataclasses.replace(told, ahead=after.ahead))
+    told = jax.tree.map(lambda x: x[after.task, after.decision.edge], book.told)
+    told = jax.tree.map(lambda x: np.repeat(x, T, 0), dataclasses.replace(told, ahead=after.decision.ahead))
     views = jax.tree.map(lambda x: np.repeat(x, T, 0), after.view)
     low = np.asarray(control(params(), views, told)[1])[::T]
-    np.testing.assert_allclose(t.bootstrap[-1][going_on], low[going_on], atol=1e-5)
+    np.testing.assert_allclose(t.bootstrap.low[-1][going_on], low[going_on], atol=1e-5)
 
 
 # --- Batches ---
 
 
-def in_time(t: Trajectory) -> dict[str, np.ndarray]:
-    names = ("reward", "terminated", "truncated", "value", "decided", "plan_value")
-    return {name: getattr(t, name) for name in names}
+def in_time(t: Step) -> dict[str, np.ndarray]:
+    ends = {name: getattr(t.outcome, name) for name in ("reward", "terminated", "truncated")}
+    return {**ends, "value": t.low.value, "decided": t.high.made, "high_value": t.high.value}
 
 
-def test_targets_of_the_originals_equal_the_reference(t: Trajectory) -> None:
+def test_targets_of_the_originals_equal_the_reference(t: Step) -> None:
     low = rollouts()[2].low
-    expected = low_reference({**in_time(t), "bootstrap": t.bootstrap}, 0.9, 0.95, True).T
-    valid = low.valid[:E]
-    np.testing.assert_allclose(low.target[:E][valid], expected[valid], rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(low.advantage[:E], low.target[:E] - t.value.T, atol=1e-5)
+    expected = low_reference({**in_time(t), "bootstrap": t.bootstrap.low}, 0.9, 0.95, True).T
+    credit = low.credit
+    valid = credit.valid[:E]
+    np.testing.assert_allclose(credit.target[:E][valid], expected[valid], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(credit.advantage[:E], credit.target[:E] - t.low.value.T, atol=1e-5)
     np.testing.assert_array_equal(valid, (t.episode < max(2, T // 5)).T)
-    np.testing.assert_array_equal(low.on_policy[:E], valid & ~t.shielded.T)
+    np.testing.assert_array_equal(credit.learns[:E], valid & ~t.low.shielded.T)
 
 
 @quick_jit
 def low_log_probs(params: Any, low: LowBatch) -> jax.Array:
-    told = jax.vmap(jax.vmap(AGENT.instruct, (None, 0)), (None, 0))(params, low.tree)
+    told = jax.vmap(jax.vmap(AGENT.low.instruct, (None, 0)), (None, 0))(params, low.trees)
     row = jnp.arange(low.slot.shape[0])[:, None]
     told = jax.tree.map(lambda x: x[row, low.slot, low.edge], told)
     told = dataclasses.replace(told, ahead=low.ahead)
-    logits, _ = jax.vmap(jax.vmap(AGENT.control, (None, 0, 0)), (None, 0, 0))(params, low.view, told)
-    return jnp.take_along_axis(jax.nn.log_softmax(logits), low.action[..., None], -1)[..., 0]
+    logits, _ = jax.vmap(jax.vmap(AGENT.low.control, (None, 0, 0)), (None, 0, 0))(params, low.view, told)
+    return jnp.take_along_axis(jax.nn.log_softmax(logits), low.decision.action[..., None], -1)[..., 0]
 
 
 def test_ratios_are_one_at_the_start_of_the_update() -> None:
@@ -336,62 +358,62 @@ def test_ratios_are_one_at_the_start_of_the_update() -> None:
     _, _, rollout = rollouts()
     low, plan = rollout.low, rollout.plan
     now = np.asarray(low_log_probs(params(), low))
-    np.testing.assert_allclose(now[low.on_policy], low.log_prob[low.on_policy], atol=1e-5)
-    assert low.on_policy[E:].sum() > 30
-    assert low.valid.shape == (2 * E, T)
-    logits, _ = plan_all(params(), plan.view, plan.tree, jax.tree.map(np.asarray, plan_state(plan)))
-    recomputed = log_probs(logits, plan.edge)
-    np.testing.assert_allclose(recomputed[plan.valid], plan.log_prob[plan.valid], atol=1e-5)
-    assert plan.valid.sum() > 50
-    assert (recomputed[plan.valid] < -0.1).sum() > 10
+    learns = low.credit.learns
+    np.testing.assert_allclose(now[learns], low.decision.log_prob[learns], atol=1e-5)
+    assert learns[E:].sum() > 30
+    assert learns.shape == (2 * E, T)
+    logits, _ = plan_all(params(), plan.view, plan.tree, plan.state)
+    recomputed, valid = log_probs(logits, plan.decision.edge), plan.credit.valid
+    np.testing.assert_allclose(recomputed[valid], plan.decision.log_prob[valid], atol=1e-5)
+    assert valid.sum() > 50
+    assert (recomputed[valid] < -0.1).sum() > 10
 
 
-def test_corrected_copies_keep_the_probability_that_their_actions_were_drawn_with(t: Trajectory) -> None:
-    relabel = dataclasses.replace(CONFIG.relabel, corrected=True)
-    agent = Agent(ENV, dataclasses.replace(CONFIG, relabel=relabel))
+def test_corrected_copies_keep_the_probability_that_their_actions_were_drawn_with(t: Step) -> None:
+    agent = Agent(ENV, evolve(CONFIG, {"relabel.corrected": True}), AGENT.method)
 
     @quick_jit
-    def rebuild(book: TaskBook, t: Trajectory) -> tuple[LowBatch, PlanBatch]:
-        return build(jax.random.key(0), agent, params(), machine(), book, t, jnp.zeros(1, jnp.uint32))
+    def rebuild(book: TaskBook, t: Step) -> tuple[LowBatch, HighBatch]:
+        return batches(agent, jax.random.key(0), params(), book, t)
 
     low, plan = jax.tree.map(np.asarray, rebuild(rollouts()[0], t))
     copied = [next(e for e in range(E) if (low.view[1][E + i] == low.view[1][e]).all()) for i in range(E)]
     assert sorted(copied) == list(range(E))
-    np.testing.assert_array_equal(low.log_prob[E:], t.log_prob.T[copied])
+    np.testing.assert_array_equal(low.decision.log_prob[E:], t.low.log_prob.T[copied])
     # The path of a copy is what happened: it was no choice. All other decisions are the rollout's.
-    drawn = plan.log_prob[plan.valid & (plan.log_prob != 0)]
-    assert 0 < len(drawn) < plan.valid.sum()
-    assert np.isin(drawn, t.plan_log_prob).all()
+    drawn = plan.decision.log_prob[plan.credit.valid & (plan.decision.log_prob != 0)]
+    assert 0 < len(drawn) < plan.credit.valid.sum()
+    assert np.isin(drawn, t.high.log_prob).all()
 
 
-def test_planner_samples_are_decisions_with_their_targets(t: Trajectory) -> None:
+def test_planner_samples_are_decisions_with_their_targets(t: Step) -> None:
     """Every sample of an original is one of the decisions of the reference, with its advantage."""
-    plan = rollouts()[2].plan
+    credit = rollouts()[2].plan.credit
     known = plan_reference_of(t)
     found = 0
-    for b in np.flatnonzero(plan.valid):
-        key = round(float(plan.advantage[b]), 3), round(float(plan.target[b]), 3)
+    for b in np.flatnonzero(credit.valid):
+        key = round(float(credit.advantage[b]), 3), round(float(credit.target[b]), 3)
         found += any(abs(key[0] - a) < 2e-3 and abs(key[1] - g) < 2e-3 for a, g in known)
-    assert found >= 0.4 * plan.valid.sum()
+    assert found >= 0.4 * credit.valid.sum()
 
 
-def plan_reference_of(t: Trajectory) -> list[tuple[float, float]]:
-    x = {**in_time(t), "bootstrap": t.plan_bootstrap}
+def plan_reference_of(t: Step) -> list[tuple[float, float]]:
+    x = {**in_time(t), "bootstrap": t.bootstrap.high}
     advantages = plan_reference(x, 0.9, 0.95)
-    return [(a, a + float(t.plan_value[where])) for where, a in advantages.items()]
+    return [(a, a + float(t.high.value[where])) for where, a in advantages.items()]
 
 
 def test_transe_pairs_lead_from_a_decision_to_where_its_sub_task_was_completed() -> None:
     plan = rollouts()[2].plan
-    pairs_ = np.flatnonzero(plan.valid & plan.completed)
+    pairs_ = np.flatnonzero(plan.credit.valid & plan.completed)
     assert len(pairs_) > 10
     here, there = position(plan.view), position(plan.next_view)
     for b in pairs_:
         assert plan.reached[b].any()
         assert (ENV.table[there[b]] >= plan.reached[b]).all()
-        edges = [k for k in range(8) if plan.tree.parent[b, k] == plan.node[b] and plan.tree.valid[b, k]]
+        edges = [k for k in range(8) if plan.tree.parent[b, k] == plan.state.node[b] and plan.tree.valid[b, k]]
         assert any((plan.tree.reach[b, k] == plan.reached[b]).all() for k in edges)
-        assert plan.edge[b] in edges
+        assert plan.decision.edge[b] in edges
         assert abs(int(here[b]) - int(there[b])) <= ENV.horizon
 
 
@@ -399,40 +421,42 @@ def test_without_unfinished_every_sample_was_completed() -> None:
     """The paper's planner data: sub-tasks that were not completed are left out."""
     _, _, rollout = rollouts()
     t = rollout.trajectory
-    config = dataclasses.replace(CONFIG, unfinished=False, relabel=RelabelConfig(share=0.0))
-    agent = Agent(ENV, config)
+    planner = dataclasses.replace(PLANNER, learns_unfinished=False)
+    agent = Agent(ENV, evolve(CONFIG, {"relabel.share": 0.0}), Ours(high=planner))
     bank = rollouts()[0]
 
     @quick_jit
-    def rebuild(book: TaskBook, t: Trajectory) -> PlanBatch:
-        return build(jax.random.key(0), agent, {}, machine(), book, t, jnp.zeros(1, jnp.uint32))[1]
+    def rebuild(book: TaskBook, t: Step) -> HighBatch:
+        return batches(agent, jax.random.key(0), {}, book, t)[1]
 
     plan = jax.tree.map(np.asarray, rebuild(bank, t))
     completed = 0
     for e in range(E):
-        for s in np.flatnonzero(t.decided[:, e] & (t.episode[:, e] < max(2, T // 5))):
+        for s in np.flatnonzero(t.high.made[:, e] & (t.episode[:, e] < max(2, T // 5))):
             end = s
-            while end < T - 1 and not (t.edge_taken | t.terminated | t.truncated)[end, e] and not t.decided[end + 1, e]:
+            o = t.outcome
+            ends = o.edge_taken | o.terminated | o.truncated
+            while end < T - 1 and not ends[end, e] and not t.high.made[end + 1, e]:
                 end += 1
-            completed += bool(t.edge_taken[end, e])
-    assert plan.valid.sum() == min(completed, len(plan.valid))
-    assert 0 < completed < t.decided.sum()
+            completed += bool(o.edge_taken[end, e])
+    assert plan.credit.valid.sum() == min(completed, len(plan.credit.valid))
+    assert 0 < completed < t.high.made.sum()
 
 
 def test_noise_is_as_correlated_as_it_is_asked_to_be() -> None:
     """An untrained policy of continuous actions is nothing but noise."""
     env = envs_jax.make("walk")
-    agent = Agent(env, small_config(num_steps=64, shield=ShieldConfig(mode="off")))
+    agent = small_agent(env, evolve(small_config(num_steps=64), {"shield.enabled": False}))
     rewards = reward_machine(env.propositions)
     bank = on_device(draw_bank(np.random.default_rng(0), agent.config.curriculum, 5, np.zeros(0, np.uint32)))
 
     @quick_jit
     def actions(correlation: jax.Array) -> jax.Array:
         state = Trainer(agent).init(jax.random.key(0), bank, rewards)
-        book = agent.open_book(state.params, jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank))
+        book = agent.low.open_book(state.params, jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank))
         pool = fill_pool(jax.random.key(1), agent, book, jnp.int32(0), size=2)
-        key = jax.random.key(2)
-        return collect(key, agent, state.params, rewards, book, state.collector, pool, correlation)[1].action
+        setting = Setting(agent, state.params, rewards, book, pool)
+        return collect(jax.random.key(2), setting, state.collector, correlation)[1].low.action
 
     for correlation in (0.0, 0.9):
         drawn = np.asarray(actions(jnp.float32(correlation)))

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hrlspec.learning.targets import low_level_targets, planner_targets
+from hrlspec.learning.targets import low_level_targets, high_level_targets
 
 T, E = 13, 7
 
 low_targets = jax.jit(low_level_targets)
-plan_targets = jax.jit(planner_targets)
+plan_targets = jax.jit(high_level_targets)
 
 
 def draw(seed: int) -> dict[str, np.ndarray]:
@@ -26,7 +26,7 @@ def draw(seed: int) -> dict[str, np.ndarray]:
     decided = rng.random((T, E)) < 0.3
     decided[1:] |= (terminated | truncated)[:-1]
     floats = {
-        name: rng.normal(size=(T, E)).astype(np.float32) for name in ("reward", "value", "bootstrap", "plan_value")
+        name: rng.normal(size=(T, E)).astype(np.float32) for name in ("reward", "value", "bootstrap", "high_value")
     }
     return {"terminated": terminated, "truncated": truncated, "decided": decided, **floats}
 
@@ -42,7 +42,7 @@ def low_reference(x: dict[str, np.ndarray], gamma: float, lam: float, max_operat
             return x["reward"][t, e] + gamma * x["bootstrap"][t, e]
         later = from_here(t + 1, e)
         if max_operator and x["decided"][t + 1, e]:
-            later = max(later, x["plan_value"][t + 1, e])
+            later = max(later, x["high_value"][t + 1, e])
         return x["reward"][t, e] + gamma * ((1 - lam) * x["value"][t + 1, e] + lam * later)
 
     return np.array([[from_here(t, e) for e in range(steps.shape[1])] for t in range(len(steps))])
@@ -67,19 +67,19 @@ def plan_reference(x: dict[str, np.ndarray], gamma: float, lam: float) -> dict[t
             elif ends:
                 ahead, later = x["bootstrap"][tau, e], 0.0
             else:
-                ahead, later = x["plan_value"][tau + 1, e], advantages[tau + 1, e]
-            advantages[t, e] = reward + factor * ahead - x["plan_value"][t, e] + factor * lam * later
+                ahead, later = x["high_value"][tau + 1, e], advantages[tau + 1, e]
+            advantages[t, e] = reward + factor * ahead - x["high_value"][t, e] + factor * lam * later
     return advantages
 
 
 def run_low(x: dict[str, Any], gamma: float, lam: float, max_operator: bool) -> np.ndarray:
-    names = ("reward", "terminated", "truncated", "value", "bootstrap", "decided", "plan_value")
+    names = ("reward", "terminated", "truncated", "value", "bootstrap", "decided", "high_value")
     result = low_targets(*(x[n] for n in names), discount=gamma, gae_lambda=lam, max_operator=max_operator)
     return np.asarray(result)
 
 
 def run_plan(x: dict[str, Any], gamma: float, lam: float) -> tuple[np.ndarray, np.ndarray]:
-    names = ("reward", "terminated", "truncated", "decided", "plan_value", "bootstrap")
+    names = ("reward", "terminated", "truncated", "decided", "high_value", "bootstrap")
     advantage, target = plan_targets(*(x[n] for n in names), discount=gamma, gae_lambda=lam)
     return np.asarray(advantage), np.asarray(target)
 
@@ -95,18 +95,18 @@ def test_low_level_targets_equal_the_reference(seed: int, gamma: float, lam: flo
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1), st.floats(0, 1))
-def test_planner_targets_equal_the_reference(seed: int, gamma: float, lam: float) -> None:
+def test_high_level_targets_equal_the_reference(seed: int, gamma: float, lam: float) -> None:
     x = draw(seed)
     advantage, target = run_plan(x, gamma, lam)
     for where, expected in plan_reference(x, gamma, lam).items():
         assert advantage[where] == pytest.approx(expected, abs=1e-4)
-        assert target[where] == pytest.approx(expected + x["plan_value"][where], abs=1e-4)
+        assert target[where] == pytest.approx(expected + x["high_value"][where], abs=1e-4)
 
 
 def quiet(**changes: Any) -> dict[str, Any]:
     """Nothing happens, all values are zero."""
     flags = {name: np.zeros((T, 1), bool) for name in ("terminated", "truncated", "decided")}
-    floats = {name: np.zeros((T, 1), np.float32) for name in ("reward", "value", "bootstrap", "plan_value")}
+    floats = {name: np.zeros((T, 1), np.float32) for name in ("reward", "value", "bootstrap", "high_value")}
     x = {**flags, **floats}
     for name, entries in changes.items():
         for t, value in entries.items():
@@ -131,7 +131,7 @@ def test_truncation_bootstraps_and_termination_does_not() -> None:
         "bootstrap": {4: 2.0},
         "reward": {4: 1.0},
         "value": {5: 100.0},
-        "plan_value": {5: 100.0},
+        "high_value": {5: 100.0},
         "decided": {5: True},
     }
     truncated = run_low(quiet(truncated={4: True}, **ends), 0.5, 0.9, True)
@@ -146,7 +146,7 @@ def test_both_at_once_is_termination() -> None:
     assert run_plan(x, 0.5, 0.9)[0][4, 0] == pytest.approx(1)
 
 
-@pytest.mark.parametrize("where", ["value", "plan_value", "reward", "bootstrap"])
+@pytest.mark.parametrize("where", ["value", "high_value", "reward", "bootstrap"])
 @pytest.mark.parametrize("end", ["terminated", "truncated"])
 def test_nothing_leaks_from_the_next_episode(where: str, end: str) -> None:
     before, after = draw(11), draw(11)
@@ -163,7 +163,7 @@ def test_nothing_leaks_from_the_next_episode(where: str, end: str) -> None:
 def test_max_operator_passes_the_larger_value_to_the_sub_task_before() -> None:
     """`a; b` with the planner knowing better (0.8) or worse (0.2) than the return that followed (0.5)."""
     for known, on, off in ((0.8, 0.8, 0.5), (0.2, 0.5, 0.5)):
-        x = quiet(decided={0: True, 3: True}, plan_value={3: known}, reward={3: 0.5}, terminated={3: True})
+        x = quiet(decided={0: True, 3: True}, high_value={3: known}, reward={3: 0.5}, terminated={3: True})
         raised, plain = run_low(x, 0.9, 1.0, True)[:, 0], run_low(x, 0.9, 1.0, False)[:, 0]
         np.testing.assert_allclose(raised[:3], on * 0.9 ** np.array([3, 2, 1]), rtol=1e-5)
         np.testing.assert_allclose(plain[:3], off * 0.9 ** np.array([3, 2, 1]), rtol=1e-5)
@@ -171,7 +171,7 @@ def test_max_operator_passes_the_larger_value_to_the_sub_task_before() -> None:
 
 def test_smdp_reward_and_bootstrap_are_discounted_per_step() -> None:
     """A decision at 2, rewards at 2, 4 and 5, the next decision at 6."""
-    x = quiet(decided={2: True, 6: True}, reward={2: 1.0, 4: 2.0, 5: 4.0}, plan_value={2: 0.3, 6: 7.0})
+    x = quiet(decided={2: True, 6: True}, reward={2: 1.0, 4: 2.0, 5: 4.0}, high_value={2: 0.3, 6: 7.0})
     advantage, target = run_plan(x, 0.5, 0.0)
     expected = 1 + 0.5**2 * 2 + 0.5**3 * 4 + 0.5**4 * 7
     assert target[2, 0] == pytest.approx(expected)
@@ -179,5 +179,5 @@ def test_smdp_reward_and_bootstrap_are_discounted_per_step() -> None:
 
 
 def test_open_decision_is_bootstrapped_at_the_rollouts_end() -> None:
-    x = quiet(decided={T - 2: True}, bootstrap={T - 1: 3.0}, plan_value={T - 2: 1.0})
+    x = quiet(decided={T - 2: True}, bootstrap={T - 1: 3.0}, high_value={T - 2: 1.0})
     assert run_plan(x, 0.5, 0.9)[0][T - 2, 0] == pytest.approx(0.25 * 3 - 1)

@@ -48,7 +48,7 @@ def turn(
 
 def reflect(
     planes: Float32[Array, "R L"], shared: Float32[Array, " F0"], reflections: Reflections, lookahead: int
-) -> tuple[Float32[Array, "R L"], Float32[Array, " F0"], Float32[Array, " A"]]:
+) -> tuple[Float32[Array, "R L"], Float32[Array, " F0"], Shaped[Array, " A"]]:
     """Reflects vectors by role so that the agent moves forward, and at rest towards what comes after the goal.
 
     Were it the goal first, the nearest of its instances would nearly always be right; see `sector_weights`.
