@@ -1,1 +1,1 @@
-"""Tasks: what they pay, and which are trained on."""
+"""Tasks: rewards, samplers, the curriculum and the banks of training tasks."""

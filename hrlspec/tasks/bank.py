@@ -8,13 +8,15 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Key, UInt32
 
+from envs_jax.arrays import Array
 from hrlspec.config import CurriculumConfig
 from hrlspec.spec import TaskTree
 from hrlspec.tasks.curriculum import draw_bank
 
 ITERATIONS_PER_BANK = 16
-"""Iterations that a bank serves."""
+"""Iterations after which a new bank is drawn."""
 
 
 class TaskBanks:
@@ -22,7 +24,7 @@ class TaskBanks:
 
     Args:
         seed: 0 or more.
-        config: what the tasks are like.
+        config: of the curriculum.
         num_propositions: P.
         reserved: uint32, hashes of held-out tasks, which are never drawn.
 
@@ -30,7 +32,9 @@ class TaskBanks:
         ValueError: no such task can be drawn.
     """
 
-    def __init__(self, seed: int, config: CurriculumConfig, num_propositions: int, reserved: np.ndarray) -> None:
+    def __init__(
+        self, seed: int, config: CurriculumConfig, num_propositions: int, reserved: UInt32[np.ndarray, " _"]
+    ) -> None:
         self._seed, self._config, self._num_propositions = seed, config, num_propositions
         self._reserved = reserved
         self._latest = 0, self._draw(0)
@@ -48,6 +52,6 @@ class TaskBanks:
         return bank
 
 
-def seed_of(key: jax.Array) -> int:
-    """The number that a key was made of, or one as good: ``seed_of(jax.random.key(7)) == 7``."""
+def seed_of(key: Key[Array, ""]) -> int:
+    """The seed of a key, ``seed_of(jax.random.key(7)) == 7``; of a derived key, its words as one integer."""
     return int.from_bytes(np.asarray(jax.random.key_data(key)).astype(">u4").tobytes(), "big")

@@ -1,6 +1,6 @@
-"""The training curriculum: which tasks are collected on, and when the next level comes (paper, "Training Curriculum").
+"""The training curriculum: its levels, the promotion between them and their tasks (paper, "Training Curriculum").
 
-Axes: **L** levels, **M** tasks per level, **E** environments.
+Axes: **L** levels, **M** tasks per level, **S** tasks drawn.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Float32, Int, Int32
+from jaxtyping import Float32, Int, Int32, UInt32
 
 from envs_jax.arrays import Array
 from hrlspec.config import CurriculumConfig
@@ -25,7 +25,7 @@ class Curriculum:
 
     Attributes:
         level: int32 ``[]``, the current level, 0-based: tasks of ``level + 1`` sub-tasks.
-        finished: int32 ``[]``, episodes of the current level finished since the last verdict.
+        finished: int32 ``[]``, episodes of the current level that ended in the current window.
         succeeded: int32 ``[]``, those that satisfied their task.
     """
 
@@ -35,7 +35,7 @@ class Curriculum:
 
 
 def initial() -> Curriculum:
-    """The first level, nothing counted yet."""
+    """The first level and an empty window."""
     return Curriculum(level=jnp.int32(0), finished=jnp.int32(0), succeeded=jnp.int32(0))
 
 
@@ -69,7 +69,7 @@ def draw_levels(chance: Float32[Array, "2 S"], level: Int32[Array, ""], earlier:
 
 
 def draw_bank(
-    rng: np.random.Generator, config: CurriculumConfig, num_propositions: int, reserved: np.ndarray
+    rng: np.random.Generator, config: CurriculumConfig, num_propositions: int, reserved: UInt32[np.ndarray, " _"]
 ) -> TaskTree:
     """A bank of L·M training tasks, level by level; none of them has a reserved hash.
 

@@ -37,7 +37,7 @@ class RewardMachine:
         subtask: float32 ``[]``, for every edge taken.
         first: int32 ``[R]``, index of the proposition that arms rule r when a taken edge reaches it.
         second: int32 ``[R]``, index of the proposition that pays rule r when a *later* taken edge reaches it.
-        avoid: bool ``[R, P]``, labels that kill rule r when seen before it is armed, or in the same step.
+        avoid: bool ``[R, P]``, labels that disable rule r when seen before it is armed, or in the same step.
         bonus: float32 ``[R]``.
     """
 

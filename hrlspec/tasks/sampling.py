@@ -6,7 +6,7 @@ edge reaches what the edge before it reached; edges out of one node reach differ
 
 Everything is vectorised over tasks and stays on the host: results have NumPy leaves with a leading axis M.
 
-Axes: **M** tasks, **N** tree nodes, **P** atomic propositions.
+Axes: **M** tasks, **D** those of them that are drawn, **N** tree nodes, **P** atomic propositions.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from collections.abc import Callable
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Int, UInt32
 
 from hrlspec.spec.hashing import task_hashes
 from hrlspec.spec.tree import TaskTree
@@ -30,7 +31,7 @@ def sample_sequences(
     num_propositions: int,
     max_nodes: int,
     max_avoid: int = 3,
-    reserved: np.ndarray | None = None,
+    reserved: UInt32[np.ndarray, "..."] | None = None,
 ) -> TaskTree:
     """Sequences of ``level`` random sub-tasks, the curriculum's tasks of that level.
 
@@ -52,7 +53,7 @@ def sample_sequences(
     _check(num_tasks=num_tasks, num_propositions=num_propositions, max_avoid=max_avoid, level=level)
     _check_room(level, num_propositions, max_nodes)
 
-    def draw(which: np.ndarray) -> TaskTree:
+    def draw(which: Int[np.ndarray, " D"]) -> TaskTree:
         trees = _blank(len(which), max_nodes, num_propositions)
         steps = np.arange(1, level + 1)
         goals = rng.integers(num_propositions, size=(len(which), level))
@@ -82,7 +83,7 @@ def sample_trees(
     max_branching: int,
     max_avoid: int = 3,
     min_leaves: int = 1,
-    reserved: np.ndarray | None = None,
+    reserved: UInt32[np.ndarray, "..."] | None = None,
 ) -> TaskTree:
     """Random trees: the unseen tasks of the evaluation and, by recipe, of the collection.
 
@@ -126,7 +127,7 @@ def sample_trees(
     if branches:
         leaves[rng.permutation(num_tasks)[: (num_tasks + 1) // 2]] = max(2, min_leaves)
 
-    def draw(which: np.ndarray) -> TaskTree:
+    def draw(which: Int[np.ndarray, " D"]) -> TaskTree:
         trees = _blank(len(which), max_nodes, num_propositions)
         _grow(rng, trees, depth[which], max_branching)
         _draw_avoid(rng, trees, max_avoid)
@@ -135,11 +136,11 @@ def sample_trees(
     return _until_good(draw, num_tasks, reserved, leaves)
 
 
-def _grow(rng: np.random.Generator, trees: TaskTree, depth: np.ndarray, max_branching: int) -> None:
+def _grow(rng: np.random.Generator, trees: TaskTree, depth: Int[np.ndarray, " D"], max_branching: int) -> None:
     """Fills structure and goals, node by node in breadth-first order, all trees at once.
 
-    ``height`` is the length of the longest path that a node still owes; nodes for it are set aside before any
-    branch may use them, so the full depth is always reached.
+    ``height`` is the length of the longest path below a node; nodes for it are reserved before any branch may use
+    them, so the full depth is always reached.
     """
     num_tasks, max_nodes, num_propositions = trees.reach.shape
     rows = np.arange(num_tasks)
@@ -186,7 +187,7 @@ def _draw_avoid(rng: np.random.Generator, trees: TaskTree, max_avoid: int) -> No
     most = max(0, min(max_avoid, num_propositions - 2))
     edge = trees.valid & (trees.parent >= 0)
     size = np.where(edge, rng.integers(0, most + 1, size=edge.shape), 0)
-    reach: np.ndarray = np.asarray(trees.reach)
+    reach: Bool[np.ndarray, "M N P"] = np.asarray(trees.reach)
     before = np.take_along_axis(reach, np.maximum(trees.parent, 0)[:, :, None], axis=1)
     lottery = rng.random((num_tasks, num_nodes, num_propositions))
     lottery[reach | before] = 2.0
@@ -195,7 +196,10 @@ def _draw_avoid(rng: np.random.Generator, trees: TaskTree, max_avoid: int) -> No
 
 
 def _until_good(
-    draw: Callable[[np.ndarray], TaskTree], num_tasks: int, reserved: np.ndarray | None, leaves: np.ndarray | None
+    draw: Callable[[Int[np.ndarray, " D"]], TaskTree],
+    num_tasks: int,
+    reserved: UInt32[np.ndarray, "..."] | None,
+    leaves: Int[np.ndarray, " M"] | None,
 ) -> TaskTree:
     """Draws all tasks, then again those that are reserved or have too few leaves."""
     which = np.arange(num_tasks)
@@ -219,7 +223,7 @@ def _until_good(
     )
 
 
-def _take(trees: TaskTree, which: np.ndarray) -> TaskTree:
+def _take(trees: TaskTree, which: Int[np.ndarray, " D"]) -> TaskTree:
     taken: TaskTree = jax.tree.map(lambda x: x[which], trees)
     return taken
 

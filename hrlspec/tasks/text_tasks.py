@@ -1,4 +1,4 @@
-"""SPECTRL tasks for the adapters of `envs_jax`: read from text, run by the monitor, paid by the reward machine.
+"""SPECTRL tasks for the adapters of `envs_jax`: parsed from text, advanced by the monitor and the reward machine.
 
 Axes: **N** tree nodes, **P** atomic propositions, **R** bonus rules.
 """
@@ -14,8 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Bool, Int32
 
 from envs_jax.adapters.tasks import Verdict
+from envs_jax.arrays import Array
 from hrlspec.spec import (
     RUNNING,
     SATISFIED,
@@ -37,7 +39,7 @@ STATUS = {RUNNING: "running", SATISFIED: "satisfied", VIOLATED: "violated"}
 
 @struct.dataclass
 class TextProgress:
-    """Where a task stands.
+    """Progress of a task.
 
     Attributes:
         task: state of the monitor.
@@ -45,7 +47,7 @@ class TextProgress:
     """
 
     task: TaskState
-    rules: jax.Array  # int32 [R]
+    rules: Int32[Array, "*lead R"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +55,7 @@ class TextTasks:
     """The task language of the adapters (`envs_jax.adapters.tasks.Tasks`): tasks are SPECTRL text.
 
     No sub-task is assigned, so that of several edges met at once the most specific one is taken, else the first.
-    The reward is 1 on completing the task, unless told otherwise; an episode terminates when the task is satisfied
+    By default the reward is 1 on completing the task and 0 otherwise; an episode terminates when the task is satisfied
     or violated.
 
     Attributes:
@@ -86,7 +88,9 @@ class TextTasks:
         """At the root, every rule waiting."""
         return TextProgress(task=initial(task), rules=rewards.initial(self._machine()))
 
-    def advance(self, task: TaskTree, progress: TextProgress, labels: jax.Array) -> tuple[TextProgress, Verdict]:
+    def advance(
+        self, task: TaskTree, progress: TextProgress, labels: Bool[Array, " P"]
+    ) -> tuple[TextProgress, Verdict]:
         """One step of monitor and reward machine."""
         before, state = progress.task, advance(task, progress.task, labels, TaskTree.NO_NODE)
         edge_taken = state.node != before.node
@@ -94,7 +98,7 @@ class TextTasks:
         rules, reward = rewards.step(
             self._machine(), progress.rules, labels, task.reach[state.node], edge_taken, satisfied & edge_taken
         )
-        # Rules watch an episode that is over no longer.
+        # Once the episode has ended, the rules no longer change.
         running = before.status == RUNNING
         rules = jnp.where(running, rules, progress.rules)
         reward = jnp.where(running, reward, 0.0)
