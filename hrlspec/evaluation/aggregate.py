@@ -1,4 +1,4 @@
-"""Several runs of one method put together.
+"""Aggregates over several runs of one method.
 
 Axes: **S** runs, **M** tasks.
 """
@@ -36,7 +36,7 @@ class Aggregate:
 
 
 def aggregate(results: Sequence[SuiteResult], *, seed: int = 0) -> Mapping[str, Aggregate]:
-    """Puts the results of several runs on one suite together.
+    """Aggregates the results of several runs on one suite.
 
     Args:
         results: one for each run.

@@ -1,4 +1,4 @@
-"""What an agent is evaluated on: tasks in layouts, with the optima against which it is measured.
+"""Cases of an evaluation: tasks in layouts, with their optima.
 
 Everything here is computed once and used for any number of agents.
 
@@ -12,8 +12,10 @@ import functools
 
 import jax
 import numpy as np
+from jaxtyping import Float32, Int, Key, UInt32
 
 from envs_jax import Environment, FiniteGraph
+from envs_jax.arrays import Array
 from envs_jax.base import Layout
 from hrlspec.evaluation.suite import Suite
 from hrlspec.exact.reference_agents import branch_scores
@@ -38,8 +40,8 @@ class Cases:
         suite: the tasks.
         task: int ``[B]``, rows of the suite.
         layouts: a layout pytree, numpy leaves with leading axis B.
-        optimum: float32 ``[B]``, least steps to satisfaction (committed reading): exact in finite environments, within
-            a step for each sub-task where the map is known; ``None`` elsewhere.
+        optimum: float32 ``[B]``, least steps to satisfaction (committed semantics): exact in finite environments,
+            within a step for each sub-task in those with a grid; ``None`` elsewhere.
         myopic: float32 ``[B]``, steps of the agent that always goes to the nearest goal, inf where it fails, or
             ``None`` likewise.
         excluded: pairs of task and layout that were drawn and left out because nothing satisfies the task within
@@ -47,10 +49,10 @@ class Cases:
     """
 
     suite: Suite
-    task: np.ndarray
+    task: Int[np.ndarray, " B"]
     layouts: Layout
-    optimum: np.ndarray | None
-    myopic: np.ndarray | None
+    optimum: Float32[np.ndarray, " B"] | None
+    myopic: Float32[np.ndarray, " B"] | None
     excluded: int
 
     def __len__(self) -> int:
@@ -73,17 +75,18 @@ class BranchCases:
         task: int ``[B]``, rows of the suite.
         layouts: a layout pytree, numpy leaves with leading axis B.
         optimum: float32 ``[B]``, the largest undiscounted return within the horizon.
-        random: float32 ``[B]``, expected return of an agent that draws its first edge uniformly and is optimal then.
-        longest: float32 ``[B]``, return of one that takes the longest branch and is optimal then.
-        excluded: pairs of task and layout that were drawn and left out because the branches' optima are too alike.
+        random: float32 ``[B]``, expected return of an agent that draws its first edge uniformly and is optimal from
+            then on.
+        longest: float32 ``[B]``, return of one that takes the longest branch and is optimal from then on.
+        excluded: pairs of task and layout that were drawn and left out because the branches' optima differ too little.
     """
 
     suite: Suite
-    task: np.ndarray
+    task: Int[np.ndarray, " B"]
     layouts: Layout
-    optimum: np.ndarray
-    random: np.ndarray
-    longest: np.ndarray
+    optimum: Float32[np.ndarray, " B"]
+    random: Float32[np.ndarray, " B"]
+    longest: Float32[np.ndarray, " B"]
     excluded: int
 
     def __len__(self) -> int:
@@ -102,9 +105,9 @@ def make_cases(
 ) -> Cases:
     """Draws layouts for each task of a suite and solves them.
 
-    A task's layouts depend on the task and the seed alone, not on the rest of the suite. Where an exact solver knows
-    that a task cannot be satisfied within the horizon the layout is left out, counted, and another one drawn, so
-    every task has the same number of cases.
+    A task's layouts depend on the task and the seed alone, not on the rest of the suite. Layouts in which the solver
+    finds the task unsatisfiable within the horizon are left out, counted and drawn again, so every task has the same
+    number of cases.
 
     Args:
         env: the environment.
@@ -162,7 +165,8 @@ def make_branch_cases(
 ) -> BranchCases:
     """Draws layouts and keeps those in which the branches' optimal returns differ.
 
-    Unlike :func:`make_cases` it draws no others: in how many layouts the branch matters is the task's nature.
+    Unlike :func:`make_cases` it draws no others: the share of layouts in which the branch matters is a property of the
+    task.
 
     Args:
         env: a :class:`envs_jax.FiniteGraph`.
@@ -221,10 +225,12 @@ def draw_layouts(env: Environment, suite: Suite, layouts_per_task: int, *, seed:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _layouts(env: Environment, key: jax.Array, hashes: jax.Array, counts: jax.Array) -> Layout:
+def _layouts(
+    env: Environment, key: Key[Array, ""], hashes: UInt32[Array, " block"], counts: UInt32[Array, " block"]
+) -> Layout:
     """A layout for each pair of a task's hash and a number, leading axis ``BLOCK``."""
 
-    def one(task: jax.Array, number: jax.Array) -> Layout:
+    def one(task: UInt32[Array, ""], number: UInt32[Array, ""]) -> Layout:
         return env.sample_layout(jax.random.fold_in(jax.random.fold_in(key, task), number), env.default_params)
 
     return jax.vmap(one)(hashes, counts)

@@ -1,4 +1,4 @@
-"""Running a trained agent on given tasks in given layouts, one episode each, all side by side.
+"""Rollouts of a trained agent on given tasks in given layouts, one episode each, vectorised over episodes.
 
 Axes: **B** episodes, **H** horizon, **N** tree nodes.
 """
@@ -14,7 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Bool, Float32, Int32, Key
 
+from envs_jax.arrays import Array
 from envs_jax.base import Layout, State
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.interaction import act, assign, start, transition
@@ -25,7 +27,7 @@ from hrlspec.tasks.rewards import RewardMachine
 
 @struct.dataclass
 class Episodes:
-    """What came of B episodes: JAX arrays in jitted code, numpy arrays outside.
+    """Outcomes of B episodes: JAX arrays in jitted code, numpy arrays outside.
 
     Attributes:
         success: bool ``[B]``, the task was satisfied within the horizon.
@@ -34,31 +36,31 @@ class Episodes:
         returns: float32 ``[B]``, undiscounted sum of rewards.
     """
 
-    success: Any  # bool [B]
-    violated: Any  # bool [B]
-    steps: Any  # int32 [B]
-    returns: Any  # float32 [B]
+    success: Bool[Array, " B"]
+    violated: Bool[Array, " B"]
+    steps: Int32[Array, " B"]
+    returns: Float32[Array, " B"]
 
 
 @struct.dataclass
 class Trace:
-    """What happened, leading axes ``[H, B]``; entry t is the state before step t, meaningful while ``running``.
+    """Trajectories, leading axes ``[H, B]``; entry t is the state before step t, meaningful while ``running``.
 
     Attributes:
         env_state: states of the environment.
         node: int32, task node.
-        assigned: int32, the edge in force.
+        assigned: int32, the edge assigned.
         running: bool.
     """
 
     env_state: State
-    node: Any  # int32 [H, B]
-    assigned: Any  # int32 [H, B]
-    running: Any  # bool [H, B]
+    node: Int32[Array, "*lead B"]
+    assigned: Int32[Array, "*lead B"]
+    running: Bool[Array, "*lead B"]
 
 
 def run_episodes(
-    key: jax.Array,
+    key: Key[Array, ""],
     agent: Agent,
     params: Params,
     machine: RewardMachine,
@@ -79,8 +81,8 @@ def run_episodes(
         trees: tasks, leading axis B; any N.
         layouts: layouts of the environment, leading axis B.
         greedy: take the most likely action and sub-task instead of sampling.
-        shield: replace actions that would step on forbidden propositions.
-        chunk: episodes run side by side; bounds memory. Each size compiles once.
+        shield: replace actions that lead to propositions to be avoided.
+        chunk: episodes run in parallel; bounds memory. Each size compiles once.
 
     Returns:
         numpy arrays, leading axis B.
@@ -99,7 +101,7 @@ def run_episodes(
 
 
 def trace_episodes(
-    key: jax.Array,
+    key: Key[Array, ""],
     agent: Agent,
     params: Params,
     machine: RewardMachine,
@@ -109,13 +111,13 @@ def trace_episodes(
     greedy: bool = False,
     shield: bool = False,
 ) -> tuple[Episodes, Trace]:
-    """As :func:`run_episodes`, for a few episodes, with the states in between."""
+    """As :func:`run_episodes`, for a few episodes, with their trajectories."""
     return jax.tree.map(np.asarray, _run(key, agent, params, machine, trees, layouts, greedy, shield, True))
 
 
 @functools.partial(jax.jit, static_argnames=("agent", "greedy", "shield", "traced"))
 def _run(
-    key: jax.Array,
+    key: Key[Array, ""],
     agent: Agent,
     params: Params,
     machine: RewardMachine,

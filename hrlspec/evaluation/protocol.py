@@ -12,8 +12,10 @@ import dataclasses
 
 import jax
 import numpy as np
+from jaxtyping import Key
 
 from envs_jax import Environment
+from envs_jax.arrays import Array
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.low_level import Params
 from hrlspec.evaluation.cases import LAYOUTS_PER_TASK, BranchCases, Cases, make_branch_cases, make_cases
@@ -26,7 +28,7 @@ from hrlspec.spec import TaskTree
 from hrlspec.tasks.rewards import RewardMachine
 
 CHUNK = 500
-"""Episodes run side by side unless told otherwise."""
+"""Default for the number of episodes run in parallel."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,8 +38,8 @@ class SuiteEvaluation:
     Attributes:
         cases: tasks in layouts.
         greedy: take the most likely action and sub-task instead of sampling.
-        shield: replace actions that would step on forbidden propositions.
-        chunk: episodes run side by side; bounds memory.
+        shield: replace actions that lead to propositions to be avoided.
+        chunk: episodes run in parallel; bounds memory.
     """
 
     cases: Cases
@@ -45,7 +47,7 @@ class SuiteEvaluation:
     shield: bool = False
     chunk: int = CHUNK
 
-    def __call__(self, key: jax.Array, agent: Agent, params: Params, machine: RewardMachine) -> SuiteResult:
+    def __call__(self, key: Key[Array, ""], agent: Agent, params: Params, machine: RewardMachine) -> SuiteResult:
         """Scores an agent. The key is consumed."""
         how = {"greedy": self.greedy, "shield": self.shield}
         cases = self.cases
@@ -62,14 +64,14 @@ class ReturnEvaluation:
     Attributes:
         cases: tasks in layouts where the branch matters.
         greedy: take the most likely action and sub-task instead of sampling.
-        chunk: episodes run side by side; bounds memory.
+        chunk: episodes run in parallel; bounds memory.
     """
 
     cases: BranchCases
     greedy: bool = False
     chunk: int = CHUNK
 
-    def __call__(self, key: jax.Array, agent: Agent, params: Params, machine: RewardMachine) -> ReturnResult:
+    def __call__(self, key: Key[Array, ""], agent: Agent, params: Params, machine: RewardMachine) -> ReturnResult:
         """Scores an agent. The key is consumed."""
         cases = self.cases
         episodes = run_episodes(
@@ -97,7 +99,7 @@ class ChoiceEvaluation:
     suite: ContestedSuite
     greedy: bool = False
 
-    def __call__(self, key: jax.Array, agent: Agent, params: Params, machine: RewardMachine) -> ChoiceResult:
+    def __call__(self, key: Key[Array, ""], agent: Agent, params: Params, machine: RewardMachine) -> ChoiceResult:
         """Scores an agent. The key is consumed."""
         suite = self.suite
         episodes, trace = trace_episodes(key, agent, params, machine, suite.tasks, suite.layouts, greedy=self.greedy)
@@ -105,11 +107,11 @@ class ChoiceEvaluation:
         away = trace.running & (trace.node != TaskTree.ROOT)
         there = jax.tree.map(lambda x: x[away.argmax(0), np.arange(x.shape[1])], trace.env_state)
         place = chosen_instances(agent.env, there, np.asarray(suite.tasks.reach[:, 1]))
-        return score_choices(suite, episodes.success, np.where(away.any(0), place, -1), greedy=self.greedy)
+        return score_choices(suite, np.asarray(episodes.success), np.where(away.any(0), place, -1), greedy=self.greedy)
 
 
 def evaluate_suite(
-    key: jax.Array,
+    key: Key[Array, ""],
     agent: Agent,
     params: Params,
     machine: RewardMachine,
@@ -132,8 +134,8 @@ def evaluate_suite(
         layouts_per_task: episodes of each task, each in a layout of its own.
         seed: of the layouts.
         greedy: take the most likely action and sub-task instead of sampling.
-        shield: replace actions that would step on forbidden propositions.
-        chunk: episodes run side by side; bounds memory.
+        shield: replace actions that lead to propositions to be avoided.
+        chunk: episodes run in parallel; bounds memory.
 
     Raises:
         ValueError: if a task cannot be satisfied in (nearly) any layout.
@@ -177,7 +179,7 @@ def final_evaluation(
         episodes: fewest episodes.
         seed: of the layouts; another one than in :func:`periodic_evaluation` unless asked.
         greedy: take the most likely action and sub-task instead of sampling.
-        shield: replace actions that would step on forbidden propositions.
+        shield: replace actions that lead to propositions to be avoided.
     """
     layouts_per_task = max(LAYOUTS_PER_TASK, -(-episodes // len(suite)))
     return SuiteEvaluation(make_cases(env, suite, layouts_per_task=layouts_per_task, seed=seed), greedy, shield)

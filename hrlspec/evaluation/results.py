@@ -1,6 +1,6 @@
-"""What evaluations report, and its JSON form.
+"""Results of evaluations and their JSON form.
 
-Intervals cover 95 % and widen for episodes of one task being alike (:mod:`hrlspec.evaluation.stats`).
+Intervals have 95 % coverage and account for the correlation of episodes of one task (:mod:`hrlspec.evaluation.stats`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _REFERENCES = ("optimal_steps_mean", "myopic_success_rate", "myopic_spl")
 
 @dataclasses.dataclass(frozen=True)
 class Score:
-    """Episodes summed up.
+    """Summary of episodes.
 
     Attributes:
         episodes: how many.
@@ -28,8 +28,8 @@ class Score:
         violation_rate: task violated, or episode ended by the environment.
         return_mean: undiscounted sum of rewards.
         steps_mean: steps of the successful episodes, all NaN when there is none.
-        spl: success weighted by path length: the mean of success × L*/max(taken, L*), L* the least number of steps in
-            the committed reading. ``None`` where L* is not known.
+        spl: success weighted by path length: the mean of success × L*/max(taken, L*), L* the least number of steps
+            under the committed semantics. ``None`` where L* is not known.
         optimal_steps_mean: mean L* of the successful episodes, or ``None`` likewise and where there is none.
         myopic_success_rate: success rate, on the same cases, of the agent that always goes to the nearest goal, or
             ``None`` likewise.
@@ -83,7 +83,7 @@ class TaskScore:
 
 @dataclasses.dataclass(frozen=True)
 class SuiteResult:
-    """How an agent did on a suite.
+    """Scores of an agent on a suite.
 
     Attributes:
         suite: its name.
@@ -182,7 +182,7 @@ class ReturnResult:
 
 @dataclasses.dataclass(frozen=True)
 class ChoiceResult:
-    """Contested choice: the mean of the two rates of right choices.
+    """Contested choice: the mean of the two rates of optimal choices.
 
     Always taking the nearest instance scores 0.5, and so does always taking a farther one.
 
@@ -190,9 +190,9 @@ class ChoiceResult:
         greedy: whether actions and sub-tasks were the most likely ones rather than sampled.
         episodes: how many cases, half of them contested.
         score: the mean of the two rates below.
-        contested: rate of right choices where the nearest instance is wrong.
-        controls: rate where it is right.
-        failures: share of episodes whose task was not satisfied; they count as wrong.
+        contested: rate of optimal choices where the nearest instance is not optimal.
+        controls: rate where it is.
+        failures: share of episodes whose task was not satisfied; they count as not optimal.
     """
 
     greedy: bool

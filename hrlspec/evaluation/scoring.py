@@ -1,4 +1,4 @@
-"""From episodes to scores: plain statistics on the host, nothing of the agent.
+"""From episodes to scores: statistics on the host.
 
 Axes: **B** episodes.
 """
@@ -6,6 +6,7 @@ Axes: **B** episodes.
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, Real
 
 from hrlspec.evaluation.cases import BranchCases, Cases
 from hrlspec.evaluation.episodes import Episodes
@@ -14,24 +15,26 @@ from hrlspec.evaluation.stats import Interval, mean_interval, rate_interval
 from hrlspec.exact.contested import ContestedSuite
 
 
-def path_ratio(success: np.ndarray, taken: np.ndarray, optimum: np.ndarray) -> np.ndarray:
+def path_ratio(
+    success: Bool[np.ndarray, " B"], taken: Real[np.ndarray, " B"], optimum: Float[np.ndarray, " B"]
+) -> Float32[np.ndarray, " B"]:
     """Success × L*/max(taken, L*) of each episode, float32 ``[B]``."""
     return np.where(success, optimum / np.maximum(taken, optimum), 0).astype(np.float32)
 
 
 def score_suite(cases: Cases, episodes: Episodes, *, horizon: int, greedy: bool, shield: bool) -> SuiteResult:
-    """Sums up one episode per case, over all, per depth and per task.
+    """Scores of one episode per case: over all, per depth and per task.
 
     Args:
         cases: B cases.
-        episodes: what came of them, leading axis B.
-        horizon: of the environment; the myopic agent has no more steps than this either.
+        episodes: their outcomes, leading axis B.
+        horizon: of the environment, for the myopic agent too.
         greedy: how actions were chosen.
         shield: whether the shield was on.
     """
     depth = cases.suite.depths[cases.task]
 
-    def score(where: np.ndarray) -> Score:
+    def score(where: Int[np.ndarray, " _"]) -> Score:
         return _score(cases, episodes, where, horizon)
 
     return SuiteResult(
@@ -49,7 +52,7 @@ def score_suite(cases: Cases, episodes: Episodes, *, horizon: int, greedy: bool,
 
 
 def score_returns(cases: BranchCases, episodes: Episodes, *, greedy: bool) -> ReturnResult:
-    """Return over optimum of one episode per case, and what the reference agents get on the same cases."""
+    """Return over optimum of one episode per case, and that of the reference agents on the same cases."""
     ratio = np.asarray(episodes.returns) / cases.optimum
     depth = cases.suite.depths[cases.task]
     return ReturnResult(
@@ -65,8 +68,10 @@ def score_returns(cases: BranchCases, episodes: Episodes, *, greedy: bool) -> Re
     )
 
 
-def score_choices(suite: ContestedSuite, success: np.ndarray, place: np.ndarray, *, greedy: bool) -> ChoiceResult:
-    """Judges where each task's first edge was taken.
+def score_choices(
+    suite: ContestedSuite, success: Bool[np.ndarray, " B"], place: Int[np.ndarray, " B"], *, greedy: bool
+) -> ChoiceResult:
+    """Rates of optimal choices, from where each task's first edge was taken.
 
     Args:
         suite: the cases.
@@ -90,7 +95,7 @@ def score_choices(suite: ContestedSuite, success: np.ndarray, place: np.ndarray,
     )
 
 
-def _score(cases: Cases, episodes: Episodes, where: np.ndarray, horizon: int) -> Score:
+def _score(cases: Cases, episodes: Episodes, where: Int[np.ndarray, " _"], horizon: int) -> Score:
     """Of the given cases."""
     task = cases.task[where]
     success, steps = np.asarray(episodes.success)[where], np.asarray(episodes.steps)[where]
@@ -114,8 +119,8 @@ def _score(cases: Cases, episodes: Episodes, where: np.ndarray, horizon: int) ->
     )
 
 
-def _mean(values: np.ndarray, task: np.ndarray) -> Interval:
-    """With episodes grouped by task; of one task alone, episodes are independent given the task."""
+def _mean(values: Real[np.ndarray, " _"], task: Int[np.ndarray, " _"]) -> Interval:
+    """The mean with episodes grouped by task; those of a single task are independent given the task."""
     return mean_interval(values, tasks=task if len(np.unique(task)) > 1 else None)
 
 

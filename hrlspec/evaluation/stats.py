@@ -1,7 +1,7 @@
-"""Estimates with intervals, for a handful of seeds and many episodes.
+"""Estimates with confidence intervals, for few seeds and many episodes.
 
-Axes: **S** seeds (or runs), **M** tasks. Episodes of one task resemble each other more than those of two, so rates and
-means over episodes accept ``tasks`` and widen their intervals accordingly. The aggregates over seeds are those of
+Axes: **S** seeds (or runs), **M** tasks. Episodes of one task are correlated, so rates and means over episodes accept
+``tasks`` and widen their intervals accordingly. The aggregates over seeds are those of
 Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice" (2021).
 """
 
@@ -12,13 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.special
+from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-Statistic = Callable[[np.ndarray], float]
+Statistic = Callable[[Float[np.ndarray, "S M"]], float]
 
 
 class Interval(NamedTuple):
-    """An estimate and the bounds of its confidence interval; a bound that cannot be had is NaN."""
+    """An estimate and the bounds of its confidence interval; a bound that cannot be computed is NaN."""
 
     estimate: float
     low: float
@@ -29,7 +30,7 @@ class Interval(NamedTuple):
 
 
 def mean_interval(values: ArrayLike, *, tasks: ArrayLike | None = None, confidence: float = 0.95) -> Interval:
-    """The mean with Student's t interval, which is honest for three seeds, where a normal interval is not.
+    """The mean with Student's t interval, whose coverage holds for three seeds, where a normal interval's does not.
 
     Args:
         values: numbers ``[n]``, such as returns; finite.
@@ -82,7 +83,7 @@ def rate_interval(outcomes: ArrayLike, *, tasks: ArrayLike | None = None, confid
 
 
 def interquartile_mean(scores: ArrayLike) -> float:
-    """The mean of the middle half of all scores, of any shape: robust like the median, and wastes less."""
+    """The mean of the middle half of all scores, of any shape: robust like the median, and more efficient."""
     ordered = np.sort(np.asarray(scores, float), axis=None)
     cut = ordered.size // 4
     return float(ordered[cut : ordered.size - cut].mean()) if ordered.size else float("nan")
@@ -98,8 +99,8 @@ def stratified_bootstrap(
 ) -> Interval:
     """A statistic over seeds and tasks with its percentile bootstrap interval.
 
-    Seeds are drawn with replacement within each task, so the tasks stay fixed: the interval says what other seeds would
-    give on the same tasks.
+    Seeds are drawn with replacement within each task, so the tasks stay fixed: the interval covers the variation over
+    seeds on the same tasks.
 
     Args:
         scores: ``[S, M]``, or ``[S]`` for one task.
@@ -130,7 +131,7 @@ def probability_of_improvement(
     if first.shape[1] != second.shape[1]:
         raise ValueError(f"both methods need the same tasks, found {first.shape[1]} and {second.shape[1]}")
 
-    def improvement(x: np.ndarray, y: np.ndarray) -> float:
+    def improvement(x: Float[np.ndarray, "S M"], y: Float[np.ndarray, "S2 M"]) -> float:
         return float((np.sign(x[:, None] - y[None]) + 1).mean() / 2)
 
     rng = np.random.default_rng(seed)
@@ -138,14 +139,14 @@ def probability_of_improvement(
     return Interval(improvement(first, second), *_percentiles(draws, confidence))
 
 
-def _standard_error(sample: np.ndarray, groups: np.ndarray) -> float:
+def _standard_error(sample: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"]) -> float:
     """Of the mean, from the groups' sums of deviations; with groups of one the usual standard error."""
     sums = np.bincount(groups, weights=sample - sample.mean())
     count = len(sums)
     return float(np.sqrt(count / (count - 1) * (sums**2).sum()) / sample.size)
 
 
-def _groups(sample: np.ndarray, tasks: ArrayLike | None) -> np.ndarray:
+def _groups(sample: Float[np.ndarray, " n"], tasks: ArrayLike | None) -> Int[np.ndarray, " n"]:
     """Consecutive numbers of the groups, int ``[n]``; every value is its own group without tasks."""
     if tasks is None:
         return np.arange(sample.size)
@@ -155,7 +156,7 @@ def _groups(sample: np.ndarray, tasks: ArrayLike | None) -> np.ndarray:
     return np.unique(names, return_inverse=True)[1]
 
 
-def _finite(values: ArrayLike, dimensions: int) -> np.ndarray:
+def _finite(values: ArrayLike, dimensions: int) -> Float[np.ndarray, "..."]:
     sample = np.asarray(values, float)
     if sample.ndim != dimensions:
         raise ValueError(f"expected {dimensions} axes, found the shape {sample.shape}")
@@ -164,7 +165,7 @@ def _finite(values: ArrayLike, dimensions: int) -> np.ndarray:
     return sample
 
 
-def _table(scores: ArrayLike) -> np.ndarray:
+def _table(scores: ArrayLike) -> Float[np.ndarray, "S M"]:
     """Scores as ``[S, M]``."""
     table = np.asarray(scores, float)
     table = _finite(table[:, None] if table.ndim == 1 else table, 2)
@@ -173,12 +174,12 @@ def _table(scores: ArrayLike) -> np.ndarray:
     return table
 
 
-def _resample(table: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _resample(table: Float[np.ndarray, "S M"], rng: np.random.Generator) -> Float[np.ndarray, "S M"]:
     rows = rng.integers(table.shape[0], size=table.shape)
     return np.take_along_axis(table, rows, axis=0)
 
 
-def _percentiles(draws: np.ndarray, confidence: float) -> tuple[float, float]:
+def _percentiles(draws: Float[np.ndarray, " _"], confidence: float) -> tuple[float, float]:
     tail = (1 - _checked(confidence)) / 2
     low, high = np.quantile(draws, [tail, 1 - tail])
     return float(low), float(high)

@@ -11,12 +11,13 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Int, Int32, Shaped, UInt32
 
 from hrlspec import spec
 from hrlspec.spec import SpecError, TaskTree, parse, task_hashes, tree_to_text
 
 MAX_NODES = 256
-"""Largest tree that a suite may hold unless told otherwise."""
+"""Default for the largest tree of a suite."""
 
 NODES_MULTIPLE = 8
 """Suites are padded to a multiple of this, so that most of them share one compiled program."""
@@ -27,7 +28,7 @@ class Suite:
     """M tasks to evaluate on.
 
     Attributes:
-        name: what results are reported under.
+        name: under which results are reported.
         formulas: SPECTRL of each task.
         trees: the tasks, numpy leaves with leading axis M.
     """
@@ -41,16 +42,16 @@ class Suite:
         return len(self.formulas)
 
     @property
-    def depths(self) -> np.ndarray:
+    def depths(self) -> Int32[np.ndarray, " M"]:
         """Edges on each task's longest path, int ``[M]``."""
         return np.asarray(self.trees.depth).max(-1)
 
     @property
-    def hashes(self) -> np.ndarray:
+    def hashes(self) -> UInt32[np.ndarray, " M"]:
         """``task_hash`` of each task, uint32 ``[M]``."""
         return task_hashes(self.trees)
 
-    def take(self, rows: Sequence[int] | np.ndarray) -> Suite:
+    def take(self, rows: Sequence[int] | Int[np.ndarray, " _"]) -> Suite:
         """Some of the tasks, under the same name and with the same N."""
         rows = np.asarray(rows)
         trees: TaskTree = jax.tree.map(lambda x: x[rows], self.trees)
@@ -105,7 +106,7 @@ def _stack(trees: Sequence[TaskTree]) -> TaskTree:
 def _resize(tree: TaskTree, size: int) -> TaskTree:
     """The same task with N = ``size``, cutting or adding padding."""
 
-    def fit(leaf: np.ndarray, fill: Any) -> np.ndarray:
+    def fit(leaf: Shaped[np.ndarray, "before ..."], fill: int) -> Shaped[np.ndarray, "after ..."]:
         fitted = np.full((size, *leaf.shape[1:]), fill, leaf.dtype)
         rows = min(size, len(leaf))
         fitted[:rows] = leaf[:rows]
