@@ -67,14 +67,14 @@ class NetworkConfig(Checked):
     where vectors are reflected, its own motion forward; in environments that say how, seen by role. What is
     learned in one direction is then known in all."""
     task_scale: float = setting(4.0, least=1e-3, most=1e3)
-    """What the low level is told of its sub-task is multiplied by this: a flag beside a hundred features of the latent
-    is hardly heard at first. The embedding of what comes after it is not: as loud, it would drown the sub-task. Where
-    the whole task is told there is no sub-task, and the embedding is multiplied."""
+    """Scale of the sub-task features that condition the low level: unscaled, a few binary features carry little weight
+    beside a hundred of the latent. The embedding of the remaining task is not scaled, or it would outweigh the
+    sub-task. Without a sub-task, conditioned on the whole task, the embedding is scaled."""
     lookahead: int = setting(2, least=0)
     """How many later sub-tasks have a role of their own."""
     memory: int = setting(0, least=0)
-    """How many of the sub-tasks completed last the low level remembers: where a reward depends on their order, what the
-    rest of the task is worth depends on them."""
+    """How many of the sub-tasks completed last the low level is conditioned on: where a reward depends on their order,
+    so does the value of the remaining task."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,7 +29,7 @@ class Agent:
     Attributes:
         env: the environment the agent acts in.
         config: the settings that all methods share.
-        method: which high level chooses, and what the low level is told.
+        method: the high level, and the conditioning of the low level.
 
     Raises:
         ConfigError: if the method's settings do not go with the shared ones.

@@ -31,10 +31,10 @@ class HighDecision:
 
     made: Bool[Array, "*lead"]  # a decision was made before this step
     edge: Int32[Array, "*lead"]  # the edge assigned
-    ahead: Float32[Array, "*lead D P"]  # what is meant to be reached 1, 2, ... sub-tasks after it
+    ahead: Float32[Array, "*lead D P"]  # reach sets of the sub-tasks planned 1, 2, ... after it
     log_prob: Float32[Array, "*lead"]
     value: Float32[Array, "*lead"]  # V^h of the remaining task
-    advice: Float32[Array, "*lead N"]  # what the low level said of each edge
+    advice: Float32[Array, "*lead N"]  # the low level's value of each edge
 
 
 @struct.dataclass
@@ -143,8 +143,8 @@ class LowBatch:
     slot: Int32[Array, "V T"]  # which of the trees
     view: View
     edge: Int32[Array, "V T"]  # the edge in force
-    ahead: Float32[Array, "V T D P"]  # what is meant to be reached after it
-    feasible: Bool[Array, "V T _"]  # [V, T, N], the open edges; empty unless the low level is told the whole task
+    ahead: Float32[Array, "V T D P"]  # reach sets of the sub-tasks planned after it
+    feasible: Bool[Array, "V T _"]  # [V, T, N], the open edges; empty unless conditioned on the whole task
     decision: LowDecision
     credit: Credit
 

@@ -29,16 +29,16 @@ Metrics = dict[str, Float32[Array, ""]]
 
 @struct.dataclass
 class Choice:
-    """What the high level thinks of the open edges; leading axis B."""
+    """Logits and values of the open edges; leading axis B."""
 
     logits: Float32[Array, "B N"]  # over edges
     value: Float32[Array, " B"]  # V^h of the remaining task
-    advice: Float32[Array, "B N"]  # what the low level said of each edge; zeros where it was not asked
-    ahead: Float32[Array, "B N D P"]  # what would be meant to be reached after each edge
+    advice: Float32[Array, "B N"]  # the low level's value of each edge; zeros where it is not used
+    ahead: Float32[Array, "B N D P"]  # reach sets of the sub-tasks planned after each edge
 
 
 class Judgement(NamedTuple):
-    """What the high level thinks of a choice that something else made; leading axis B."""
+    """The high level's log-probability and value of a given choice; leading axis B."""
 
     log_prob: Float32[Array, " B"]
     value: Float32[Array, " B"]
@@ -97,10 +97,10 @@ class HighLevel(abc.ABC):
     def choose(
         self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
     ) -> Choice:
-        """What it thinks of the open edges in B environments.
+        """Evaluates the open edges in B environments.
 
         Args:
-            low: the low level, which may be asked.
+            low: the low level, whose values may be used.
             params: parameters of all parts.
             view: what is seen.
             tree: the tasks.

@@ -1,4 +1,4 @@
-"""The low level: what it is told of a task, how it acts, and the reach critic behind its shield.
+"""The low level: its instruction, its policy and value, and the reach critic of its shield.
 
 Axes: **N** tree nodes, **P** atomic propositions, **D** later sub-tasks, **K** candidate actions, **M** tasks,
 **B** environments of a batch.
@@ -30,7 +30,7 @@ Params = dict[str, Any]
 
 @struct.dataclass
 class TaskBook:
-    """M tasks, and what the low level is told of them, computed once per task and parameters.
+    """M tasks and the instructions for their edges, computed once per task and parameters.
 
     Attributes:
         tree: the tasks, leading axis M.
@@ -48,8 +48,8 @@ class LowLevel:
     Attributes:
         env: the environment it acts in.
         config: the run's configuration.
-        sees: what it is told of the task.
-        follows_plan: whether the high level hands it the sequence that it means to follow.
+        sees: the part of the task that it is conditioned on.
+        follows_plan: whether it is conditioned on the sequence of sub-tasks planned by the high level.
     """
 
     env: Environment
@@ -95,15 +95,15 @@ class LowLevel:
         feasible: Bool[Array, "*lead _"],
         ahead: Float32[Array, "*lead D P"],
     ) -> Instruction:
-        """What the low level is told at single moments.
+        """The instructions at single time steps.
 
         Args:
             params: the networks' parameters.
-            told: the instructions for whole tasks, as a book has them: any leading axes, then N.
-            where: indices of the moments' tasks, one for each leading axis.
-            edge: int32 ``[...]``, the edges in force.
-            feasible: bool ``[..., N]``, the open ones; read where the whole task is told.
-            ahead: float32 ``[..., D, P]``, what the high level means to reach afterwards.
+            told: the instructions for every edge, as in a `TaskBook`: any leading axes, then N.
+            where: indices of the tasks, one for each leading axis.
+            edge: int32 ``[...]``, the edges assigned.
+            feasible: bool ``[..., N]``, the open edges; used where the policy is conditioned on the whole task.
+            ahead: float32 ``[..., D, P]``, the reach sets of the sub-tasks planned after them.
         """
         if self.sees != "whole task":
             return dataclasses.replace(jax.tree.map(lambda x: x[(*where, edge)], told), ahead=ahead)
@@ -125,7 +125,7 @@ class LowLevel:
 
         Args:
             params: the networks' parameters.
-            view: what is seen.
+            view: observations.
             told: the instruction for each edge, leading axes ``[B, N]``.
             edge: int32 ``[B]``.
             feasible: bool ``[B, N]``, the open edges.

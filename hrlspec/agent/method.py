@@ -1,4 +1,4 @@
-"""A method as a value: a high level, what the low level is told, and what both demand of the shared settings."""
+"""A method as a value: a high level, the conditioning of the low level, and both levels' shared settings."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Method(abc.ABC):
         high: the high level.
         name: as flags and run folders know it.
         about: one line for ``--help``.
-        sees: what the low level is told of the task.
+        sees: the part of the task that the low level is conditioned on.
     """
 
     high: HighLevel

@@ -56,7 +56,7 @@ def high_batch(key: Key[Array, ""], agent: Agent, x: Experience, settings: PPOCo
     advantage, target = high_level_targets(
         *_in_time(outcome.reward, outcome.terminated, outcome.truncated, x.high.made, x.high.value, x.bootstrap.high),
         discount=agent.config.discount,
-        # What the generator picked says nothing of what the policy would go on to do: its returns count as they are.
+        # Choices of the task generator are no samples of the policy: their returns count with λ = 1.
         gae_lambda=jnp.where(x.learns_high.T, settings.gae_lambda, 1.0),
     )
     advantage = ppo.scaled(advantage.T, x.high.value, settings)
@@ -101,7 +101,7 @@ def _endings(x: Experience) -> tuple[Int32[Array, "V T"], Bool[Array, "V T"]]:
 
 
 def _feasible(agent: Agent, x: Experience) -> Bool[Array, "V T _"]:
-    """Open edges ``[V, T, N]`` where the low level is told of them, else ``[V, T, 0]``."""
+    """Open edges ``[V, T, N]`` where the low level is conditioned on them, else ``[V, T, 0]``."""
     if agent.method.sees != "whole task":
         return jnp.zeros((*x.slot.shape, 0), bool)
     rows = jnp.arange(x.slot.shape[0])[:, None]

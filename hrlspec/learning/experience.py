@@ -1,4 +1,4 @@
-"""From rollouts to experience: what was collected, and relabelled copies of it, under one roof.
+"""From rollouts to experience: the transitions collected, and relabelled copies of them.
 
 A relabelled copy of an environment's rollout counts as one more environment, so that both levels learn from originals
 and copies with the same code.
@@ -27,7 +27,7 @@ from hrlspec.spec import RUNNING, TaskState, initial
 from hrlspec.tasks.rewards import RewardMachine
 
 JUDGED_AT_ONCE = 128
-"""Choices of copies that the high level judges at a time."""
+"""Choices of copies that the high level evaluates at a time."""
 
 
 def gather(
@@ -95,7 +95,7 @@ def copies(
     rollout: Step,
     reserved: UInt32[Array, " M"],
 ) -> Experience:
-    """Relabelled copies of the given environments' rollouts, with both levels' opinion of them under the new tasks."""
+    """Relabelled copies of the given environments' rollouts, with both levels' estimates under the new tasks."""
     record = _record(agent, book, rollout)
     new = _relabelled(keys, agent, machine, record, reserved)
     slot = jnp.minimum(rollout.episode, new.tree.parent.shape[1] - 1)
@@ -130,7 +130,7 @@ def copies(
 def _opinions(
     agent: Agent, params: Params, rollout: Step, new: Relabelled, slot: Int32[Array, "E T"]
 ) -> tuple[HighDecision, LowDecision]:
-    """What both levels think, under the new tasks, of what was done."""
+    """Both levels' log-probabilities and values of the recorded decisions under the new tasks."""
     row = (jnp.arange(slot.shape[0])[:, None] * new.tree.parent.shape[1] + slot).reshape(-1)
     fresh = agent.low.open_book(params, jax.tree.map(_flat, new.tree))
     view, edge, node = jax.tree.map(_flat, (rollout.view, new.assigned, new.node))
@@ -205,7 +205,7 @@ def _told(
     node: Int32[Array, " R"],
     new: Relabelled,
 ) -> Instruction:
-    """What the low level would have been told under the new tasks, leading axis R."""
+    """The low level's instructions under the new tasks, leading axis R."""
     tree = fresh.tree
     feasible = tree.valid[row] & (tree.parent[row] == node[:, None])
     told = agent.low.told_now(params, fresh.told, (row,), edge, feasible, fresh.told.ahead[row, edge])
@@ -228,7 +228,7 @@ def _judged(
     edge: Int32[Array, " R"],
     decided: Bool[Array, " R"],
 ) -> Judgement:
-    """What the high level thinks of the completed path's choices, leading axis R; zeros where there was none."""
+    """The high level's estimates of the completed path's choices, leading axis R; zeros where there was none."""
 
     def judge(inputs: tuple[View, Array, Array, Array]) -> Judgement:
         view, row, node, edge = inputs

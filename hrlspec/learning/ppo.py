@@ -68,8 +68,8 @@ def value_loss(
 def entropy_loss(entropy: Float32[Array, ""], settings: PPOConfig, progress: Float32[Array, ""]) -> Float32[Array, ""]:
     """Minus the weighted mean entropy, and the square of what it lacks of the floor.
 
-    Near the optimum normalised advantages are mostly noise, which drives a policy to certainty; what keeps it from
-    there must grow as it gets near.
+    Near the optimum normalised advantages are mostly noise, which drives the policy to determinism; the weight of the
+    entropy must grow as the entropy falls.
     """
     weight = annealed(settings.entropy, settings.final_entropy, progress)
     if not settings.entropy_floor:

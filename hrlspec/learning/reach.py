@@ -1,4 +1,4 @@
-"""The reach critic's lessons: Q-learning of all goals from every transition (paper, "Avoiding Propositions").
+"""Training of the reach critic: Q-learning of all goals from every transition (paper, "Avoiding Propositions").
 
 Axes: **E** environments, **T** time steps, **P** atomic propositions.
 """

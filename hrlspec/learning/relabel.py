@@ -77,8 +77,8 @@ def visits(record: Record) -> Record:
     """The same rollout with whatever was visited as a completed sub-task, in hindsight (Andrychowicz et al., 2017).
 
     A sub-task is completed wherever a proposition holds for the first time since the last one was; it keeps its
-    ``ensuring`` part where it was the one completed on purpose. What nobody asked for is learned as well: without it,
-    a region found too rarely is forgotten before it is learned.
+    ``ensuring`` part where it was the one assigned. Goals that were not assigned are learned as well, so that regions
+    visited rarely have samples.
     """
 
     def step(seen: Bool[Array, " P"], inputs: tuple[Array, ...]) -> tuple[Bool[Array, " P"], tuple[Array, ...]]:
@@ -164,7 +164,7 @@ def _completed_before(record: Record) -> Int32[Array, " T"]:
 def _path(
     record: Record, done_before: Int32[Array, " T"], num_slots: int, max_path: int
 ) -> tuple[Int32[Array, " S"], Bool[Array, "S K P"], Bool[Array, "S K P"], Bool[Array, "S K P"]]:
-    """The completed path of each slot: length ``[S]``, reach, avoid and the labels seen on the way, ``[S, K, P]``."""
+    """The completed path of each slot: length ``[S]``, reach, avoid and the labels seen along it, ``[S, K, P]``."""
     num_propositions = record.labels.shape[-1]
     empty = jnp.zeros((num_slots, max_path, num_propositions), jnp.int32)
     slot, place = record.slot, done_before

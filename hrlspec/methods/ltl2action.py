@@ -1,4 +1,4 @@
-"""The baseline LTL2Action: one flat policy that is told the whole remaining task (Vaezipoor et al., 2021).
+"""The baseline LTL2Action: one flat policy conditioned on the whole remaining task (Vaezipoor et al., 2021).
 
 Relabelling and curriculum as the paper grants them. Axes: **B** environments of a batch, **N** tree nodes.
 """
@@ -54,10 +54,10 @@ class LTL2Action(Method):
     sees: ClassVar[Sees] = "whole task"
 
     def configure(self, config: Config) -> Config:
-        """No sub-task, so no roles to see the world by, and no proposition that a shield could know to avoid."""
+        """Without a sub-task there are no roles to encode the observation by, and no avoid set for the shield."""
         network = dataclasses.replace(
             config.network,
-            # All that it knows of the task goes through these.
+            # The only features of the task that it is conditioned on.
             task_features=NetworkConfig.task_features,
             task_rounds=0,
             roles=False,

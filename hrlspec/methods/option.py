@@ -1,4 +1,4 @@
-"""The baseline Option: value iteration over what options were measured to take (Araki et al., 2021).
+"""The baseline Option: value iteration over measured durations of options (Araki et al., 2021).
 
 An option reaches one sub-goal and knows nothing of what comes after it. What it takes to reach one sub-goal from
 another is measured while collecting, and what each sub-goal earns, whatever came before it ("estimated empirically for
@@ -34,7 +34,7 @@ _LEAST = 1e-9
 
 @struct.dataclass
 class Measurements:
-    """Sums over attempts to reach a goal, older ones fading.
+    """Sums over attempts to reach a goal, with exponential decay.
 
     Attributes:
         attempts: float32 ``[O, P]``.
@@ -81,7 +81,7 @@ def measure(
         duration: int32, steps since the sub-task was assigned, this one included.
         reward: float32, of this step.
         discount: γ.
-        fading: what is left of the weight of what was measured before.
+        fading: decay of the weight of earlier measurements.
     """
     origin, goal = origin.astype(jnp.float32), goal.astype(jnp.float32)
     success = ended & reached
@@ -113,7 +113,7 @@ def values(known: Measurements, tree: TaskTree, state: TaskState) -> Float32[Arr
     ``Q(q, e) = D_e (R_e + max_e' Q(q', e'))`` with the measured E[γ^duration] D_e and reward R_e; -inf on other nodes.
     A conjunction takes as long as the longest of its goals.
     """
-    # What was never tried keeps its first guess, also when that has faded to nothing.
+    # Goals never attempted keep the prior, also when its weight has decayed to zero.
     per_attempt = (known.discounted + _LEAST) / (known.attempts + _LEAST)
     per_success = known.rewards / (known.successes + _LEAST)
     origin = origins(tree)[tree.parent].astype(jnp.float32)
@@ -137,9 +137,9 @@ class LogicValueIteration(Checked, HighLevel):
     """Chooses options by value iteration over the task tree, with what each was measured to take and to earn."""
 
     sharpness: float = setting(100.0, least=0, most=1e6)
-    """Logits per unit of value: at 100 a hundredth counts as much as the noise that options are sampled with."""
+    """Logits per unit of value, the inverse temperature of the choice among options."""
     fading: float = setting(0.98, least=0, most=1)
-    """What is left of a measurement's weight an iteration later: options change while they are learned."""
+    """Decay of a measurement's weight per iteration: options change while they are learned."""
 
     def init(self, key: Key[Array, ""], low: LowLevel, view: View, tree: TaskTree) -> Measurements:
         """See :class:`HighLevel`."""

@@ -100,7 +100,7 @@ class ImplicitPlanner(Checked, HighLevel):
     ) -> Judgement:
         """See :class:`HighLevel`.
 
-        A copy ends in success, its returns are known: the planner is asked only where something depends on it.
+        A copy ends in success and its returns are known: the planner is evaluated only where its outputs are used.
         """
         if self.learns_from_copies or self.max_operator:
             return super().judge(low, params, view, tree, state, told, edge)

@@ -26,7 +26,7 @@ from hrlspec.spec import TaskTree, subtask_avoid
 
 @struct.dataclass
 class Instruction:
-    """What the low level is told.
+    """The instruction of the low level: the assigned sub-task and the tasks around it.
 
     Attributes:
         reach: float32 ``[P]``, p₊ of the assigned sub-task.
@@ -45,8 +45,8 @@ class Instruction:
 
 
 Sees = Literal["future", "sub-task", "whole task"]
-"""What the low level is told: its sub-task and what remains after it, its sub-task alone, or the whole remaining task
-with what each edge forbids, and no sub-task."""
+"""What the low level is conditioned on: its sub-task and what remains after it, its sub-task alone, or the whole
+remaining task, with the avoid sets of its edges, and no sub-task."""
 
 
 class Controller(nn.Module):
@@ -55,8 +55,8 @@ class Controller(nn.Module):
     Attributes:
         config: sizes.
         num_outputs: of the actor; they describe a distribution of `hrlspec.agent.distributions`.
-        sees: what it is told of the task.
-        follows_plan: whether what remains is one sequence, which the high level means to follow, instead of a tree.
+        sees: the part of the task that it is conditioned on.
+        follows_plan: whether what remains is the one sequence planned by the high level, instead of a tree.
         symmetries: how the world can be turned or reflected, if at all.
     """
 
@@ -144,8 +144,8 @@ class Controller(nn.Module):
         return jnp.concatenate([roles, planes]) if self.config.names else roles
 
     def _of_task(self, told: Instruction) -> tuple[Float32[Array, " _"], Float32[Array, " F"]]:
-        """What is told of the sub-task and of what comes before it, scaled, and the embedding of what remains."""
+        """Features of the sub-task and of those before it, scaled, and the embedding of what remains."""
         future = self.task_embedding.of_sequence(told.ahead) if self.follows_plan else told.future
         told_now = self.config.task_scale * jnp.concatenate([told.reach, told.avoid, *told.behind])
-        # A future as loud as the sub-task drowns it; where there is no sub-task, it is all that is told.
+        # An embedding of the same scale would outweigh the sub-task; without a sub-task it is the only conditioning.
         return told_now, future * (self.config.task_scale if self.sees == "whole task" else 1.0)

@@ -65,9 +65,9 @@ def lookback(tree: TaskTree, depth: int) -> Bool[Array, "N D P"]:
 
 
 def routes(tree: TaskTree, node: Int32[Array, ""], length: int) -> Int32[Array, "N length"]:
-    """The way from ``node`` to every node below it: its first ``length`` nodes, int32 ``[N, length]``.
+    """The path from ``node`` to every node below it: its first ``length`` nodes, int32 ``[N, length]``.
 
-    ``NO_NODE`` stands where the way has ended, and everywhere for nodes that are not below.
+    ``NO_NODE`` after the end of the path, and everywhere for nodes that are not below.
     """
     place = jnp.arange(length)
     nothing = jnp.full((tree.num_nodes, length), TaskTree.NO_NODE, jnp.int32)
@@ -118,7 +118,7 @@ class TaskEmbedding(nn.Module):
         return x
 
     def messages(self, tree: TaskTree) -> Float32[Array, "N F"]:
-        """What the task beyond each edge has to say, float32 ``[N, F]``; `of_edges` reads it."""
+        """The message sent along each edge, float32 ``[N, F]``, for `of_edges`."""
         return self._sweep(tree)[1]
 
     def of_edges(
