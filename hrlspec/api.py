@@ -1,6 +1,6 @@
-"""Two doors to the library: `train` an agent, `evaluate` it. Everything behind them can be used by itself.
+"""Entry points of the library: `train` an agent, `evaluate` it. What they call can be used by itself.
 
-Axes: **S** seeds trained side by side.
+Axes: **S** seeds trained in parallel.
 """
 
 from __future__ import annotations
@@ -13,20 +13,23 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Key, Shaped, UInt32
 
 from envs_jax import Environment
+from envs_jax.arrays import Array
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.low_level import Params
 from hrlspec.agent.method import Method
 from hrlspec.config import evolve
 from hrlspec.evaluation import Suite, SuiteResult, evaluate_suite, suite_from_text
+from hrlspec.learning.optimiser import Metrics
 from hrlspec.learning.train import Trainer, TrainState
 from hrlspec.presets import Preset, Recipe, RewardSet, preset, preset_for
 from hrlspec.spec import TaskTree
 from hrlspec.tasks.bank import TaskBanks, seed_of
 from hrlspec.tasks.rewards import RewardMachine
 
-Progress = Callable[[int, Mapping[str, np.ndarray]], object]
+Progress = Callable[[int, Mapping[str, Shaped[np.ndarray, "..."]]], object]
 """Called after each iteration with the environment steps done and its metrics, float32 ``[]``, or ``[S]``."""
 
 
@@ -36,8 +39,8 @@ class TrainedAgent:
 
     Attributes:
         agent: environment, settings and method.
-        params: parameters, leading axis S where S seeds were trained side by side.
-        rewards: what it was trained for.
+        params: parameters, leading axis S where S seeds were trained in parallel.
+        rewards: the reward machine it was trained with.
     """
 
     agent: Agent
@@ -45,12 +48,12 @@ class TrainedAgent:
     rewards: RewardMachine
 
     def __getitem__(self, seed: int) -> TrainedAgent:
-        """One of S agents trained side by side."""
+        """One of S agents trained in parallel."""
         return dataclasses.replace(self, params=jax.tree.map(lambda x: x[seed], self.params))
 
 
 def train(
-    key: jax.Array,
+    key: Key[Array, "*S"],
     env: str | Environment,
     *,
     total_steps: int | None = None,
@@ -64,7 +67,7 @@ def train(
     """Trains an agent on a curriculum of random tasks (paper, "Algorithm").
 
     Args:
-        key: one key, or S keys for S agents trained side by side (vmapped), each as it would be by itself.
+        key: one key, or S keys for S agents trained in parallel (vmapped), each with the result of training alone.
         env: the name of a preset, or any environment; its settings are then chosen by its spaces.
         total_steps: environment steps for each agent; the preset's if not given.
         method: one of `hrlspec.methods.METHODS` by name, or a value of a `hrlspec.methods.Method`.
@@ -72,7 +75,7 @@ def train(
         reward_set: 1, for completing the task, or 2, also for sub-tasks and for some orders of them.
         changes: shared settings to change, by dotted names such as ``{"low.optimiser.learning_rate": 1e-3}``.
         held_out: tasks that must not be trained on, besides the preset's test suites.
-        progress: told after each iteration; waits for it, which costs a little.
+        progress: called after each iteration; blocks until the iteration's metrics are computed.
 
     Raises:
         ValueError: there is no such preset or method, or no training task can be drawn.
@@ -87,7 +90,7 @@ def train(
 
 
 def evaluate(
-    key: jax.Array,
+    key: Key[Array, ""],
     trained: TrainedAgent,
     tasks: str | Suite,
     *,
@@ -96,7 +99,7 @@ def evaluate(
     greedy: bool = False,
     shield: bool = False,
 ) -> SuiteResult:
-    """Lets a trained agent carry out tasks in random layouts.
+    """Evaluates a trained agent on tasks in random layouts.
 
     Args:
         key: of the agent's and the environment's randomness; consumed.
@@ -105,7 +108,7 @@ def evaluate(
         episodes: in all; at least one for each task.
         seed: of the layouts.
         greedy: take the most likely action and sub-task instead of sampling.
-        shield: replace actions that would step on forbidden propositions.
+        shield: replace actions that lead to propositions to be avoided.
 
     Raises:
         SpecError: a task cannot be read.
@@ -127,7 +130,11 @@ def evaluate(
 
 
 def _params(
-    key: jax.Array, trainer: Trainer, machine: RewardMachine, reserved: np.ndarray, progress: Progress | None
+    key: Key[Array, "*S"],
+    trainer: Trainer,
+    machine: RewardMachine,
+    reserved: UInt32[np.ndarray, " _"],
+    progress: Progress | None,
 ) -> Params:
     """Parameters after all iterations, for one key or S keys."""
     config, num_propositions = trainer.agent.config, trainer.agent.env.num_propositions
@@ -150,19 +157,19 @@ def _params(
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _init_all(trainer: Trainer, keys: jax.Array, banks: TaskTree, machine: RewardMachine) -> Any:
+def _init_all(trainer: Trainer, keys: Key[Array, " S"], banks: TaskTree, machine: RewardMachine) -> TrainState:
     """`Trainer.init` for S seeds, each with a bank of its own."""
     return jax.vmap(trainer.init, in_axes=(0, 0, None))(keys, banks, machine)
 
 
 @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
 def _iterate_all(
-    trainer: Trainer, states: TrainState, banks: TaskTree, machine: RewardMachine, reserved: jax.Array
-) -> Any:
+    trainer: Trainer, states: TrainState, banks: TaskTree, machine: RewardMachine, reserved: UInt32[Array, " _"]
+) -> tuple[TrainState, Metrics]:
     """`Trainer.iterate` for S seeds."""
     return jax.vmap(trainer.iterate, in_axes=(0, 0, None, None))(states, banks, machine, reserved)
 
 
-def _reserved(world: Preset, held_out: Suite | None) -> np.ndarray:
+def _reserved(world: Preset, held_out: Suite | None) -> UInt32[np.ndarray, " _"]:
     """Sorted hashes of tasks that training must not see, uint32."""
     return world.reserved if held_out is None else np.union1d(world.reserved, held_out.hashes)
