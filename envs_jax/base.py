@@ -19,7 +19,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Bool, Float, Float32, Int, Int32, Key, Shaped
 
+from envs_jax.arrays import Array
 from envs_jax.scenes import Scene
 
 Layout = Any
@@ -28,8 +30,8 @@ Layout = Any
 State = Any
 """Everything that changes within an episode and the layout it takes place in: a pytree of arrays."""
 
-Info = dict[str, jax.Array]
-StepResult = tuple[jax.Array, State, jax.Array, jax.Array, jax.Array, Info]
+Info = dict[str, Shaped[Array, "..."]]
+StepResult = tuple[Float32[Array, "..."], State, Float32[Array, ""], Bool[Array, ""], Bool[Array, ""], Info]
 
 
 @struct.dataclass
@@ -40,7 +42,7 @@ class EnvParams:
         horizon: int32 ``[]``, steps after which an episode is truncated.
     """
 
-    horizon: jax.Array  # int32 []
+    horizon: Int32[Array, "*lead"]
 
 
 @struct.dataclass
@@ -55,7 +57,7 @@ class Discrete:
     shape: ClassVar[tuple[int, ...]] = ()
     dtype: ClassVar[Any] = np.int32
 
-    def sample(self, key: jax.Array) -> jax.Array:
+    def sample(self, key: Key[Array, ""]) -> Int32[Array, ""]:
         """A uniform element, int32 ``[]``."""
         return jax.random.randint(key, (), 0, self.n, jnp.int32)
 
@@ -80,7 +82,7 @@ class Box:
     shape: tuple[int, ...] = struct.field(pytree_node=False)
     dtype: ClassVar[Any] = np.float32
 
-    def sample(self, key: jax.Array) -> jax.Array:
+    def sample(self, key: Key[Array, ""]) -> Float32[Array, "..."]:
         """A uniform element, float32 ``shape``."""
         return jax.random.uniform(key, self.shape, jnp.float32, self.low, self.high)
 
@@ -173,14 +175,16 @@ class Environment(abc.ABC):
         return EnvParams(horizon=jnp.int32(self.horizon))
 
     @abc.abstractmethod
-    def resample_layout(self, key: jax.Array, layout: Layout, needed: jax.Array, params: EnvParams) -> Layout:
+    def resample_layout(
+        self, key: Key[Array, ""], layout: Layout, needed: Bool[Array, ""], params: EnvParams
+    ) -> Layout:
         """A layout that differs from ``layout`` where ``needed`` (bool ``[]``) is true, else ``layout`` itself.
 
         Written so that under ``vmap`` a step at which no episode ends costs (nearly) nothing.
         """
 
     @abc.abstractmethod
-    def sample_layout(self, key: jax.Array, params: EnvParams) -> Layout:
+    def sample_layout(self, key: Key[Array, ""], params: EnvParams) -> Layout:
         """A random layout; ``vmap`` over keys for a pool."""
 
     @abc.abstractmethod
@@ -188,11 +192,13 @@ class Environment(abc.ABC):
         """Raises ``ValueError`` if a given layout (numpy) cannot be used; shapes and dtypes are taken as right."""
 
     @abc.abstractmethod
-    def reset_to(self, layout: Layout, key: jax.Array, params: EnvParams) -> tuple[jax.Array, State]:
+    def reset_to(self, layout: Layout, key: Key[Array, ""], params: EnvParams) -> tuple[Float32[Array, "..."], State]:
         """Starts an episode in a given layout: ``(observation, state)``."""
 
     @abc.abstractmethod
-    def step_env(self, key: jax.Array, state: State, action: jax.Array, params: EnvParams) -> StepResult:
+    def step_env(
+        self, key: Key[Array, ""], state: State, action: Int[Array, ""] | Float[Array, " A"], params: EnvParams
+    ) -> StepResult:
         """One raw step, without auto-reset.
 
         Returns:
@@ -201,27 +207,31 @@ class Environment(abc.ABC):
         """
 
     @abc.abstractmethod
-    def labels(self, state: State, params: EnvParams) -> jax.Array:
+    def labels(self, state: State, params: EnvParams) -> Bool[Array, " P"]:
         """The propositions that hold in a state, bool ``[P]``."""
 
     @abc.abstractmethod
-    def observation(self, state: State, params: EnvParams) -> jax.Array:
+    def observation(self, state: State, params: EnvParams) -> Float32[Array, "..."]:
         """What the agent sees, float32 ``observation_shape``."""
 
     @abc.abstractmethod
-    def proposition_view(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def proposition_view(
+        self, observation: Float32[Array, "..."]
+    ) -> tuple[Float32[Array, "P ..."], Float32[Array, " F0"]]:
         """Splits an observation into what belongs to each proposition and what is shared by all.
 
         Returns:
             ``(per_proposition, shared)``: float32 ``[P, ...]`` and float32 ``[F0]`` (may be empty).
         """
 
-    def reset(self, key: jax.Array, params: EnvParams) -> tuple[jax.Array, State]:
+    def reset(self, key: Key[Array, ""], params: EnvParams) -> tuple[Float32[Array, "..."], State]:
         """Starts an episode in a new layout: ``(observation, state)``."""
         layout_key, start_key = jax.random.split(key)
         return self.reset_to(self.sample_layout(layout_key, params), start_key, params)
 
-    def step(self, key: jax.Array, state: State, action: jax.Array, params: EnvParams) -> StepResult:
+    def step(
+        self, key: Key[Array, ""], state: State, action: Int[Array, ""] | Float[Array, " A"], params: EnvParams
+    ) -> StepResult:
         """:meth:`step_env` with auto-reset into a layout that differs from the one that ended.
 
         Where the episode ended, the returned observation and state are the next episode's first ones, and
@@ -251,7 +261,9 @@ class FiniteGraph(Environment):
     """An environment that is a finite labelled graph with deterministic steps, for exact solvers."""
 
     @abc.abstractmethod
-    def transition_table(self, layout: Layout, params: EnvParams) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def transition_table(
+        self, layout: Layout, params: EnvParams
+    ) -> tuple[Int32[Array, "S A"], Bool[Array, "S P"], Int32[Array, ""]]:
         """The graph of a layout.
 
         Returns:
@@ -260,7 +272,7 @@ class FiniteGraph(Environment):
         """
 
     @abc.abstractmethod
-    def graph_state(self, state: State) -> jax.Array:
+    def graph_state(self, state: State) -> Int32[Array, ""]:
         """Which of the S states of :meth:`transition_table` the environment is in, int32 ``[]``."""
 
 
@@ -268,7 +280,7 @@ class GridMap(Environment):
     """An environment in the plane whose whole steps lead from places of a grid to their neighbours, or nowhere."""
 
     @abc.abstractmethod
-    def grid(self, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def grid(self, layout: Layout) -> tuple[Bool[np.ndarray, "X Y P"], Bool[np.ndarray, "X Y"], Int[np.ndarray, " 2"]]:
         """The places that whole steps lead to. On the host.
 
         Args:
@@ -284,7 +296,9 @@ class ContestedLayouts(Environment):
     """An environment that draws layouts on which the nearest goal is often not the one to begin with."""
 
     @abc.abstractmethod
-    def contested_layout(self, key: jax.Array, first: jax.Array, second: jax.Array, params: EnvParams) -> Layout:
+    def contested_layout(
+        self, key: Key[Array, ""], first: Bool[Array, " P"], second: Bool[Array, " P"], params: EnvParams
+    ) -> Layout:
         """A random layout for the task "first, then second" on which going to the nearest first costs steps later.
 
         Args:
@@ -310,12 +324,17 @@ class ContestedChoice(ContestedLayouts):
         """Indices of (first, second) propositions that contested layouts can be about."""
 
     @abc.abstractmethod
-    def instance_at(self, state: State, goal: jax.Array) -> jax.Array:
+    def instance_at(self, state: State, goal: Bool[Array, " P"]) -> Int32[Array, ""]:
         """Which instance of a proposition (``goal``, one-hot bool ``[P]``) the agent is nearest to, int32 ``[]``."""
 
     @abc.abstractmethod
     def contested_layout(
-        self, key: jax.Array, first: jax.Array, second: jax.Array, params: EnvParams, mirrored: jax.Array | bool = False
+        self,
+        key: Key[Array, ""],
+        first: Bool[Array, " P"],
+        second: Bool[Array, " P"],
+        params: EnvParams,
+        mirrored: Bool[Array, ""] | bool = False,
     ) -> Layout:
         """As in :class:`ContestedLayouts`; instance 0 of the first proposition is the right one.
 
@@ -336,5 +355,5 @@ class Drawable(Environment):
         """What there is to see in an unbatched layout (numpy leaves) besides the agent. On the host."""
 
     @abc.abstractmethod
-    def position(self, state: State) -> jax.Array:
+    def position(self, state: State) -> Shaped[Array, " _"]:
         """Where the agent is, in the scene's coordinates, ``[2]``, or ``[3]`` with its heading in radians."""

@@ -15,7 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Bool, Float, Float32, Int, Int32, Key
 
+from envs_jax.arrays import Array
 from envs_jax.base import Box, Discrete, Environment, EnvParams, StepResult
 
 Observation = Any
@@ -78,7 +80,7 @@ class ForeignState:
     inner: Inner
     observation: jax.Array
     layout: Start
-    time: jax.Array  # int32 []
+    time: Int32[Array, "*lead"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -221,12 +223,12 @@ class Foreign(Environment):
             )
         return inner
 
-    def sample_layout(self, key: jax.Array, params: EnvParams) -> Start:
+    def sample_layout(self, key: Key[Array, ""], params: EnvParams) -> Start:
         """A start, as the foreign environment draws it."""
         observation, inner = self.source.reset(_raw(key), _inner(params))
         return Start(inner=_like(inner, self.template), observation=self.form.pack(observation))
 
-    def resample_layout(self, key: jax.Array, layout: Start, needed: jax.Array, params: EnvParams) -> Start:
+    def resample_layout(self, key: Key[Array, ""], layout: Start, needed: Bool[Array, ""], params: EnvParams) -> Start:
         """A start other than ``layout`` where ``needed``, unless ``MOST_DRAWS`` draws in a row give the same.
 
         The loop starts out finished where nothing is needed: a vmapped step at which no episode ends draws nothing.
@@ -251,14 +253,18 @@ class Foreign(Environment):
         if not np.isfinite(layout.observation).all():
             raise ValueError("the first observation is not finite")
 
-    def reset_to(self, layout: Start, key: jax.Array, params: EnvParams) -> tuple[jax.Array, ForeignState]:
+    def reset_to(
+        self, layout: Start, key: Key[Array, ""], params: EnvParams
+    ) -> tuple[Float32[Array, "..."], ForeignState]:
         """Starts as in a given layout."""
         del key, params
         layout = jax.tree.map(jnp.asarray, layout)
         state = ForeignState(inner=layout.inner, observation=layout.observation, layout=layout, time=jnp.int32(0))
         return state.observation, state
 
-    def step_env(self, key: jax.Array, state: ForeignState, action: jax.Array, params: EnvParams) -> StepResult:
+    def step_env(
+        self, key: Key[Array, ""], state: ForeignState, action: Int[Array, ""] | Float[Array, " A"], params: EnvParams
+    ) -> StepResult:
         """One step; see :meth:`Environment.step_env`."""
         # Rebuilt, since some environments write into their state's dictionaries.
         before = jax.tree.map(lambda x: x, state.inner)
@@ -274,7 +280,7 @@ class Foreign(Environment):
         terminated = terminated if self.terminates else jnp.zeros_like(terminated)
         return stepped.observation, stepped, jnp.float32(0.0), terminated, late | timed_out, {}
 
-    def labels(self, state: ForeignState, params: EnvParams) -> jax.Array:
+    def labels(self, state: ForeignState, params: EnvParams) -> Bool[Array, " P"]:
         """What the labelling function says of the foreign state, bool ``[P]``."""
         del params
         found = self.labelling(state.inner)
@@ -282,12 +288,14 @@ class Foreign(Environment):
             return jnp.stack([jnp.asarray(found[name]) for name in self.names])
         return jnp.asarray(found)
 
-    def observation(self, state: ForeignState, params: EnvParams) -> jax.Array:
+    def observation(self, state: ForeignState, params: EnvParams) -> Float32[Array, "..."]:
         """What the foreign environment showed, float32 ``observation_shape``."""
         del params
         return state.observation
 
-    def proposition_view(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def proposition_view(
+        self, observation: Float32[Array, "..."]
+    ) -> tuple[Float32[Array, "P ..."], Float32[Array, " F0"]]:
         """As ``view`` splits it. Without one: nothing (float32 ``[P, 0]``), and all that is seen in a row, ``[F]``.
 
         Shared numbers are scaled to [-1, 1] by their bounds where these are known.
@@ -419,7 +427,7 @@ def _check_view(env: Foreign) -> None:
         )
 
 
-def _raw(key: jax.Array) -> jax.Array:
+def _raw(key: Key[Array, ""]) -> jax.Array:
     """The key as uint32 ``[2]``: states may hold one, and are saved as arrays of numbers."""
     return jax.random.key_data(key) if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else key
 

@@ -14,7 +14,9 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Bool, Float, Float32, Int, Key
 
+from envs_jax.arrays import Array
 from envs_jax.base import Environment, EnvParams, Layout, State
 
 Task = Any
@@ -34,9 +36,9 @@ class Verdict:
         success: bool ``[]``, the task is done.
     """
 
-    reward: jax.Array  # float32 []
-    ended: jax.Array  # bool []
-    success: jax.Array  # bool []
+    reward: Float32[Array, "*lead"]
+    ended: Bool[Array, "*lead"]
+    success: Bool[Array, "*lead"]
 
 
 class Tasks(Protocol):
@@ -115,15 +117,15 @@ class Step:
 
     observation: jax.Array
     progress: Progress
-    labels: jax.Array  # bool [P]
-    reward: jax.Array  # float32 []
-    terminated: jax.Array  # bool []
-    truncated: jax.Array  # bool []
-    success: jax.Array  # bool []
+    labels: Bool[Array, "*lead P"]
+    reward: Float32[Array, "*lead"]
+    terminated: Bool[Array, "*lead"]
+    truncated: Bool[Array, "*lead"]
+    success: Bool[Array, "*lead"]
 
 
 def begin(
-    env: Environment, tasks: Tasks, key: jax.Array, task: Task, params: EnvParams, layout: Layout | None = None
+    env: Environment, tasks: Tasks, key: Key[Array, ""], task: Task, params: EnvParams, layout: Layout | None = None
 ) -> tuple[jax.Array, Episode]:
     """Starts an episode, in a new layout unless one is given: ``(observation, episode)``. The key is consumed."""
     observation, state = env.reset(key, params) if layout is None else env.reset_to(layout, key, params)
@@ -131,7 +133,13 @@ def begin(
 
 
 def step(
-    env: Environment, tasks: Tasks, key: jax.Array, episode: Episode, task: Task, action: jax.Array, params: EnvParams
+    env: Environment,
+    tasks: Tasks,
+    key: Key[Array, ""],
+    episode: Episode,
+    task: Task,
+    action: Int[Array, ""] | Float[Array, " A"],
+    params: EnvParams,
 ) -> tuple[Episode, Step]:
     """One step of environment and task, without auto-reset. The key is consumed."""
     observation, state, reward, failed, truncated, _ = env.step_env(key, episode.state, action, params)
@@ -153,7 +161,7 @@ def begin_where(
     env: Environment,
     tasks: Tasks,
     done: jax.Array,
-    key: jax.Array,
+    key: Key[Array, ""],
     now: jax.Array,
     episode: Episode,
     task: Task,

@@ -8,12 +8,15 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int, Int8, Int32, Key
+
+from envs_jax.arrays import Array
 
 FAR = 60
 """Steps to a letter that is not there; twice this fits 8 bits, which make the search eight times as fast as 32."""
 
 
-def myopia_regret(layout: jax.Array, num_letters: int) -> jax.Array:
+def myopia_regret(layout: Int[Array, "n n"], num_letters: int) -> Int8[Array, "P P"]:
     """Steps lost by nearest-first for every pair of letters, on the way from (0, 0) to the first, then to the second.
 
     Among equally near cells of the first letter the worst counts, and nothing is avoided: this ranks layouts, it does
@@ -40,7 +43,9 @@ def myopia_regret(layout: jax.Array, num_letters: int) -> jax.Array:
     return jnp.where(nearest, total, jnp.int8(-1)).max(-1) - total.min(-1)
 
 
-def most_contested(key: jax.Array, regret: jax.Array, tries: int) -> tuple[jax.Array, jax.Array]:
+def most_contested(
+    key: Key[Array, ""], regret: Int8[Array, "P P"], tries: int
+) -> tuple[Int32[Array, ""], Int32[Array, ""]]:
     """The pair of letters with the largest regret among ``tries`` random ones, int32 ``[]`` each. Consumes the key."""
     num_letters = regret.shape[0]
     chance = jax.random.uniform(key, (2, tries))

@@ -9,13 +9,14 @@ import dataclasses
 import functools
 import itertools
 import string
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Bool, Float32, Int, Int8, Int32, Key, Shaped, UInt32
 
+from envs_jax.arrays import Array
 from envs_jax.base import (
     Box,
     ContestedLayouts,
@@ -54,9 +55,9 @@ class LetterState:
         time: int32 ``[]``, steps taken.
     """
 
-    position: jax.Array  # int32 [2]
-    layout: jax.Array  # int8 [n, n]
-    time: jax.Array  # int32 []
+    position: Int32[Array, "*lead 2"]
+    layout: Int8[Array, "*lead n n"]
+    time: Int32[Array, "*lead"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,12 +144,14 @@ class Letter(Symmetric, FiniteGraph, ContestedLayouts, Drawable):
             actions.append(tuple(int(np.flatnonzero((move == MOVES).all(1))[0]) for move in turned))
         return Symmetries(actions=tuple(actions))
 
-    def sample_layout(self, key: jax.Array, params: EnvParams) -> jax.Array:
+    def sample_layout(self, key: Key[Array, ""], params: EnvParams) -> Int8[Array, "n n"]:
         """A random layout, int8 ``[n, n]``: uniform over those in which every letter can be reached."""
         nothing = jnp.full((self.size, self.size), NO_LETTER, jnp.int8)
         return self.resample_layout(key, nothing, jnp.bool_(True), params)
 
-    def contested_layout(self, key: jax.Array, first: jax.Array, second: jax.Array, params: EnvParams) -> jax.Array:
+    def contested_layout(
+        self, key: Key[Array, ""], first: Bool[Array, " P"], second: Bool[Array, " P"], params: EnvParams
+    ) -> Int8[Array, "n n"]:
         """A random layout for a task that wants one letter and then another, chosen for what nearest-first would lose.
 
         The letters of a random layout trade places, so that the pair of letters on which nearest-first loses most,
@@ -172,7 +175,9 @@ class Letter(Symmetric, FiniteGraph, ContestedLayouts, Drawable):
         renamed = jnp.where(layout == NO_LETTER, NO_LETTER, name[layout]).astype(jnp.int8)
         return jnp.where(first.any() & second.any(), renamed, layout)
 
-    def resample_layout(self, key: jax.Array, layout: jax.Array, needed: jax.Array, params: EnvParams) -> jax.Array:
+    def resample_layout(
+        self, key: Key[Array, ""], layout: Int[Array, "n n"], needed: Bool[Array, ""], params: EnvParams
+    ) -> Int8[Array, "n n"]:
         """A random layout other than ``layout`` where ``needed``, else ``layout``.
 
         The loop starts out finished where nothing is needed: a vmapped step at which no episode ends draws nothing.
@@ -180,7 +185,7 @@ class Letter(Symmetric, FiniteGraph, ContestedLayouts, Drawable):
         del params
         previous = layout
 
-        def draw(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        def draw(carry: tuple[Array, Array, Array]) -> tuple[Key[Array, ""], Int8[Array, "n n"], Bool[Array, ""]]:
             key, _, _ = carry
             key, draw_key = jax.random.split(key)
             candidate = self._place_letters(draw_key)
@@ -188,7 +193,7 @@ class Letter(Symmetric, FiniteGraph, ContestedLayouts, Drawable):
 
         return jax.lax.while_loop(lambda carry: ~carry[2], draw, (key, layout, ~needed))[1]
 
-    def check_layout(self, layout: np.ndarray) -> None:
+    def check_layout(self, layout: Int[np.ndarray, "n n"]) -> None:
         """Raises ``ValueError`` unless cells hold known letters and (0, 0) holds none.
 
         Letter counts and reachability are not asked of given layouts: a hand-made one may break them on purpose.
@@ -200,7 +205,9 @@ class Letter(Symmetric, FiniteGraph, ContestedLayouts, Drawable):
         if layout[0, 0] != NO_LETTER:
             raise ValueError("the start cell (0, 0) bears a letter")
 
-    def reset_to(self, layout: jax.Array, key: jax.Array, params: EnvParams) -> tuple[jax.Array, LetterState]:
+    def reset_to(
+        self, layout: Int[Array, "n n"], key: Key[Array, ""], params: EnvParams
+    ) -> tuple[Float32[Array, "..."], LetterState]:
         """Starts at (0, 0) in a given layout (int ``[n, n]``)."""
         del key
         state = LetterState(
@@ -208,7 +215,9 @@ class Letter(Symmetric, FiniteGraph, ContestedLayouts, Drawable):
         )
         return self.observation(state, params), state
 
-    def step_env(self, key: jax.Array, state: LetterState, action: jax.Array, params: EnvParams) -> StepResult:
+    def step_env(
+        self, key: Key[Array, ""], state: LetterState, action: Int[Array, ""], params: EnvParams
+    ) -> StepResult:
         """One move; see :meth:`Environment.step_env`."""
         del key
         state = LetterState(
@@ -219,12 +228,12 @@ class Letter(Symmetric, FiniteGraph, ContestedLayouts, Drawable):
         truncated = state.time >= params.horizon
         return self.observation(state, params), state, jnp.float32(0.0), jnp.bool_(False), truncated, {}
 
-    def labels(self, state: LetterState, params: EnvParams) -> jax.Array:
+    def labels(self, state: LetterState, params: EnvParams) -> Bool[Array, " P"]:
         """The letter of the agent's cell, bool ``[P]``, at most one of them true."""
         del params
         return state.layout[state.position[0], state.position[1]] == jnp.arange(self.num_letters)
 
-    def observation(self, state: LetterState, params: EnvParams) -> jax.Array:
+    def observation(self, state: LetterState, params: EnvParams) -> Float32[Array, "..."]:
         """The grid around the agent, float32 ``[n, n, P + 1]``."""
         del params
         offsets = np.arange(self.size) - self.size // 2
@@ -236,14 +245,18 @@ class Letter(Symmetric, FiniteGraph, ContestedLayouts, Drawable):
         agent[self.size // 2, self.size // 2] = True
         return jnp.concatenate([letters, agent], axis=-1).astype(jnp.float32)
 
-    def proposition_view(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def proposition_view(
+        self, observation: Float32[Array, "..."]
+    ) -> tuple[Float32[Array, "P ..."], Float32[Array, " F0"]]:
         """Each letter's plane, float32 ``[P, n, n]``; nothing is shared (float32 ``[0]``).
 
         The agent's own plane is the same always, so it is left out.
         """
         return jnp.moveaxis(observation[..., : self.num_letters], -1, 0), jnp.zeros(0, jnp.float32)
 
-    def transition_table(self, layout: Any, params: EnvParams) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def transition_table(
+        self, layout: Int[Array, "n n"], params: EnvParams
+    ) -> tuple[Int32[Array, "S A"], Bool[Array, "S P"], Int32[Array, ""]]:
         """The world as a finite labelled graph, for exact solvers.
 
         Args:
@@ -258,20 +271,20 @@ class Letter(Symmetric, FiniteGraph, ContestedLayouts, Drawable):
         labels = jnp.asarray(layout).reshape(-1, 1) == jnp.arange(self.num_letters)
         return jnp.asarray(_successors(self.size)), labels, jnp.int32(0)
 
-    def graph_state(self, state: LetterState) -> jax.Array:
+    def graph_state(self, state: LetterState) -> Int32[Array, ""]:
         """The agent's cell as a state of :meth:`transition_table`, int32 ``[]``."""
         return state.position[0] * self.size + state.position[1]
 
-    def scene(self, layout: Any) -> GridScene:
+    def scene(self, layout: Int[Array, "n n"]) -> GridScene:
         """The grid of letters."""
         letters = np.asarray(layout).tolist()
         return GridScene(tuple(tuple(self.propositions[i] if i >= 0 else "" for i in row) for row in letters))
 
-    def position(self, state: LetterState) -> jax.Array:
+    def position(self, state: LetterState) -> Shaped[Array, " _"]:
         """Row and column, int32 ``[2]``."""
         return state.position
 
-    def _place_letters(self, key: jax.Array) -> jax.Array:
+    def _place_letters(self, key: Key[Array, ""]) -> Int8[Array, "n n"]:
         """Letters on uniformly drawn cells other than (0, 0), int8 ``[n, n]``.
 
         The rank of a cell among random numbers says which letter it bears: comparisons only, since a sort
@@ -285,19 +298,19 @@ class Letter(Symmetric, FiniteGraph, ContestedLayouts, Drawable):
         letter = jnp.where(rank < self.num_cells, rank // (self.num_cells // self.num_letters), NO_LETTER)
         return jnp.concatenate([jnp.full(1, NO_LETTER), letter]).reshape(self.size, self.size).astype(jnp.int8)
 
-    def _all_reachable(self, layout: jax.Array) -> jax.Array:
+    def _all_reachable(self, layout: Int[Array, "n n"]) -> Bool[Array, ""]:
         """Whether each letter has a cell next to those reachable from (0, 0) over letter-free cells, bool ``[]``."""
         # A row is one word, a cell one bit: the fill is a handful of integer operations on n words.
         bit = jnp.uint32(1) << jnp.arange(self.size, dtype=jnp.uint32)
         free = jnp.where(layout == NO_LETTER, bit, jnp.uint32(0)).sum(-1, dtype=jnp.uint32)
         start = jnp.zeros(self.size, jnp.uint32).at[0].set(1)
 
-        def spread(rows: jax.Array) -> jax.Array:
+        def spread(rows: UInt32[Array, " n"]) -> UInt32[Array, " n"]:
             left = ((rows << 1) | (rows >> (self.size - 1))) & jnp.uint32(2**self.size - 1)
             right = (rows >> 1) | ((rows & 1) << (self.size - 1))
             return rows | left | right | jnp.roll(rows, 1) | jnp.roll(rows, -1)
 
-        def grow(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        def grow(carry: tuple[Array, Array]) -> tuple[UInt32[Array, " n"], UInt32[Array, " n"]]:
             reached, _ = carry
             # Four rounds a turn: the test for a fixed point costs more than a round.
             wider = reached
@@ -313,14 +326,14 @@ class Letter(Symmetric, FiniteGraph, ContestedLayouts, Drawable):
         return ((layout[..., None] == letters) & touched[..., None]).any((0, 1)).all()
 
 
-def _with_neighbours(cells: np.ndarray) -> np.ndarray:
+def _with_neighbours(cells: Bool[np.ndarray, "*lead n n"]) -> Bool[np.ndarray, "*lead n n"]:
     """The given cells and those one move away, bool ``[..., n, n]``."""
     rows = np.roll(cells, 1, -2) | np.roll(cells, -1, -2)
     columns = np.roll(cells, 1, -1) | np.roll(cells, -1, -1)
     return cells | rows | columns
 
 
-def _successors(size: int) -> np.ndarray:
+def _successors(size: int) -> Int32[np.ndarray, "S A"]:
     """The cell each move leads to, int32 ``[S, A]``."""
     cells = np.stack(np.divmod(np.arange(size**2), size), -1)
     moved = (cells[:, None] + MOVES) % size

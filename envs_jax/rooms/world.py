@@ -12,7 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Bool, Float32, Int, Int32, Key, Shaped
 
+from envs_jax.arrays import Array
 from envs_jax.base import Box, Discrete, Drawable, EnvParams, StepResult
 from envs_jax.scenes import GridScene
 
@@ -29,20 +31,20 @@ _MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)], np.int32)
 class RoomsLayout:
     """Cells, row and column: the start and the key in the first room, a red ball in the second, a blue in the third."""
 
-    start: jax.Array  # int32 [2]
-    key: jax.Array  # int32 [2]
-    red: jax.Array  # int32 [2]
-    blue: jax.Array  # int32 [2]
+    start: Int32[Array, "*lead 2"]
+    key: Int32[Array, "*lead 2"]
+    red: Int32[Array, "*lead 2"]
+    blue: Int32[Array, "*lead 2"]
 
 
 @struct.dataclass
 class RoomsState:
     """A running episode."""
 
-    position: jax.Array  # int32 [2]
-    has_key: jax.Array  # bool []
+    position: Int32[Array, "*lead 2"]
+    has_key: Bool[Array, "*lead"]
     layout: RoomsLayout
-    time: jax.Array  # int32 []
+    time: Int32[Array, "*lead"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +62,7 @@ class Rooms(Drawable):
     observation_shape = (4, ROWS, COLUMNS)
     observation_space = Box(low=0.0, high=1.0, shape=(4, ROWS, COLUMNS))
 
-    def sample_layout(self, key: jax.Array, params: EnvParams) -> RoomsLayout:
+    def sample_layout(self, key: Key[Array, ""], params: EnvParams) -> RoomsLayout:
         """Uniform cells in their rooms; the key at the far wall, on no direct way from the start to the door."""
         del params
         rows = jax.random.randint(key, (4,), 0, ROOM)
@@ -68,7 +70,9 @@ class Rooms(Drawable):
         columns = columns.at[1].set(0) + (ROOM + 1) * np.array([0, 0, 1, 2])
         return RoomsLayout(*jnp.stack([rows, columns], -1).astype(jnp.int32))
 
-    def resample_layout(self, key: jax.Array, layout: RoomsLayout, needed: jax.Array, params: EnvParams) -> RoomsLayout:
+    def resample_layout(
+        self, key: Key[Array, ""], layout: RoomsLayout, needed: Bool[Array, ""], params: EnvParams
+    ) -> RoomsLayout:
         """Another layout where ``needed``; the start moves on by a cell if all were drawn alike."""
         drawn = self.sample_layout(key, params)
         same = jnp.stack([(x == y).all() for x, y in zip(jax.tree.leaves(drawn), jax.tree.leaves(layout), strict=True)])
@@ -84,14 +88,16 @@ class Rooms(Drawable):
             if not (0 <= row < ROOM and 0 <= column < ROOM):
                 raise ValueError(f"{name} is not in room {room + 1}")
 
-    def reset_to(self, layout: RoomsLayout, key: jax.Array, params: EnvParams) -> tuple[jax.Array, RoomsState]:
+    def reset_to(
+        self, layout: RoomsLayout, key: Key[Array, ""], params: EnvParams
+    ) -> tuple[Float32[Array, "..."], RoomsState]:
         """Starts without the key."""
         del key
         layout = jax.tree.map(jnp.asarray, layout)
         state = RoomsState(layout.start, (layout.start == layout.key).all(), layout, jnp.int32(0))
         return self.observation(state, params), state
 
-    def step_env(self, key: jax.Array, state: RoomsState, action: jax.Array, params: EnvParams) -> StepResult:
+    def step_env(self, key: Key[Array, ""], state: RoomsState, action: Int[Array, ""], params: EnvParams) -> StepResult:
         """One move."""
         del key
         there = state.position + jnp.asarray(_MOVES)[action]
@@ -111,19 +117,21 @@ class Rooms(Drawable):
             {},
         )
 
-    def labels(self, state: RoomsState, params: EnvParams) -> jax.Array:
+    def labels(self, state: RoomsState, params: EnvParams) -> Bool[Array, " P"]:
         """Which ball's cell the agent is in."""
         del params
         return jnp.stack([(state.position == ball).all() for ball in (state.layout.blue, state.layout.red)])
 
-    def observation(self, state: RoomsState, params: EnvParams) -> jax.Array:
+    def observation(self, state: RoomsState, params: EnvParams) -> Float32[Array, "..."]:
         """One image each for blue, red, the agent and the key."""
         del params
         layout = state.layout
         images = [_image(x) for x in (layout.blue, layout.red, state.position)]
         return jnp.stack([*images, _image(layout.key) * ~state.has_key]).astype(jnp.float32)
 
-    def proposition_view(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def proposition_view(
+        self, observation: Float32[Array, "..."]
+    ) -> tuple[Float32[Array, "P ..."], Float32[Array, " F0"]]:
         """The balls belong to propositions, agent and key to none."""
         return observation[:2], observation[2:].reshape(-1)
 
@@ -137,12 +145,12 @@ class Rooms(Drawable):
         walls = tuple((row, column) for row in range(ROWS) for column in DOORS if row != MIDDLE)
         return GridScene(tuple(map(tuple, cells)), walls)
 
-    def position(self, state: RoomsState) -> jax.Array:
+    def position(self, state: RoomsState) -> Shaped[Array, " _"]:
         """Row and column, int32 ``[2]``."""
         return state.position
 
 
-def _image(cell: jax.Array) -> jax.Array:
+def _image(cell: Int32[Array, " 2"]) -> Bool[Array, "H W"]:
     return (np.arange(ROWS)[:, None] == cell[0]) & (np.arange(COLUMNS) == cell[1])
 
 
@@ -153,7 +161,7 @@ def fewest_steps(layout: RoomsLayout, *, key_first: bool) -> int:
     return sum(_distance(here, there) for here, there in itertools.pairwise(stops))
 
 
-def _distance(here: np.ndarray, there: np.ndarray) -> int:
+def _distance(here: Int[np.ndarray, " 2"], there: Int[np.ndarray, " 2"]) -> int:
     """Steps through the doors between two cells."""
     if here[1] // (ROOM + 1) != there[1] // (ROOM + 1):
         rows = abs(here[0] - MIDDLE) + abs(there[0] - MIDDLE)

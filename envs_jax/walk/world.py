@@ -14,8 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Bool, Float, Float32, Int, Int32, Key, Shaped
 from scipy import ndimage
 
+from envs_jax.arrays import Array
 from envs_jax.base import Box, Drawable, EnvParams, GridMap, StepResult
 from envs_jax.scenes import DiscScene, Region
 
@@ -63,8 +65,8 @@ class WalkLayout:
         discs: float32 ``[3, P, K]``: the centres' x, their y, the radii; ``NO_DISC`` as the radius of padding.
     """
 
-    start: jax.Array  # float32 [2]
-    discs: jax.Array  # float32 [3, P, K]
+    start: Float[Array, "*lead 2"]
+    discs: Float[Array, "*lead 3 P K"]
 
 
 @struct.dataclass
@@ -77,9 +79,9 @@ class WalkState:
         time: int32 ``[]``, steps taken.
     """
 
-    position: jax.Array  # float32 [2]
+    position: Float32[Array, "*lead 2"]
     layout: WalkLayout
-    time: jax.Array  # int32 []
+    time: Int32[Array, "*lead"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,11 +169,13 @@ class Walk(GridMap, Drawable):
         """How far to go along x and y, as a share of ``step_size``."""
         return Box(low=-1.0, high=1.0, shape=(2,))
 
-    def sample_layout(self, key: jax.Array, params: EnvParams) -> WalkLayout:
+    def sample_layout(self, key: Key[Array, ""], params: EnvParams) -> WalkLayout:
         """The environment's regions, always the same, and a start."""
         return self.resample_layout(key, jax.tree.map(jnp.asarray, self._layout()), jnp.bool_(True), params)
 
-    def resample_layout(self, key: jax.Array, layout: WalkLayout, needed: jax.Array, params: EnvParams) -> WalkLayout:
+    def resample_layout(
+        self, key: Key[Array, ""], layout: WalkLayout, needed: Bool[Array, ""], params: EnvParams
+    ) -> WalkLayout:
         """The same regions, since nothing shows where they are; another start where starts are random and ``needed``.
 
         The loop starts out finished where nothing is needed: a vmapped step at which no episode ends draws nothing.
@@ -180,7 +184,7 @@ class Walk(GridMap, Drawable):
         if self.start is not None:
             return layout
 
-        def draw(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        def draw(carry: tuple[Array, Array, Array]) -> tuple[Key[Array, ""], Float32[Array, " 2"], Bool[Array, ""]]:
             key, _, _ = carry
             key, draw_key = jax.random.split(key)
             candidate = self.observation_space.sample(draw_key)
@@ -207,14 +211,18 @@ class Walk(GridMap, Drawable):
             names = [name for name, holds in zip(self.propositions, held, strict=True) if holds]
             raise ValueError(f"the start {start.tolist()} is in the region of {', '.join(names)}")
 
-    def reset_to(self, layout: WalkLayout, key: jax.Array, params: EnvParams) -> tuple[jax.Array, WalkState]:
+    def reset_to(
+        self, layout: WalkLayout, key: Key[Array, ""], params: EnvParams
+    ) -> tuple[Float32[Array, "..."], WalkState]:
         """Starts at the start of a given layout."""
         del key
         layout = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), layout)
         state = WalkState(position=layout.start, layout=layout, time=jnp.int32(0))
         return self.observation(state, params), state
 
-    def step_env(self, key: jax.Array, state: WalkState, action: jax.Array, params: EnvParams) -> StepResult:
+    def step_env(
+        self, key: Key[Array, ""], state: WalkState, action: Float[Array, " A"], params: EnvParams
+    ) -> StepResult:
         """One step; see :meth:`Environment.step_env`."""
         del key
         moved = state.position + jnp.float32(self.step_size) * jnp.clip(action, -1.0, 1.0)
@@ -224,23 +232,27 @@ class Walk(GridMap, Drawable):
         truncated = state.time >= params.horizon
         return self.observation(state, params), state, jnp.float32(0.0), out, truncated, {}
 
-    def labels(self, state: WalkState, params: EnvParams) -> jax.Array:
+    def labels(self, state: WalkState, params: EnvParams) -> Bool[Array, " P"]:
         """The regions that the point is in, bool ``[P]``."""
         del params
         return _inside(state.layout.discs, state.position)
 
-    def observation(self, state: WalkState, params: EnvParams) -> jax.Array:
+    def observation(self, state: WalkState, params: EnvParams) -> Float32[Array, "..."]:
         """The position, float32 ``[2]``."""
         del params
         return state.position
 
-    def proposition_view(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def proposition_view(
+        self, observation: Float32[Array, "..."]
+    ) -> tuple[Float32[Array, "P ..."], Float32[Array, " F0"]]:
         """Nothing is seen of any proposition (float32 ``[P, 0]``); shared is the position, scaled to [-1, 1]."""
         middle, half = (self.high + self.low) / 2, (self.high - self.low) / 2
         shared = (observation - jnp.float32(middle)) * jnp.float32(1 / half)
         return jnp.zeros((self.num_propositions, 0), jnp.float32), shared
 
-    def grid(self, layout: WalkLayout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def grid(
+        self, layout: WalkLayout
+    ) -> tuple[Bool[np.ndarray, "X Y P"], Bool[np.ndarray, "X Y"], Int[np.ndarray, " 2"]]:
         """The places that whole steps lead to, for planners: a grid of ``step_size`` through the start. On the host.
 
         A step leads to any of the eight neighbours or nowhere, so the way between two places takes exactly as many
@@ -270,17 +282,17 @@ class Walk(GridMap, Drawable):
         ]
         return DiscScene(tuple(regions), self.low, self.high)
 
-    def position(self, state: WalkState) -> jax.Array:
+    def position(self, state: WalkState) -> Shaped[Array, " _"]:
         """The point, float32 ``[2]``, x and y."""
         return state.position
 
-    def _layout(self) -> Any:
+    def _layout(self) -> WalkLayout:
         """The environment's own layout (numpy), with the square's corner for a start that is still to be drawn."""
         start = (self.low, self.low) if self.start is None else self.start
         return WalkLayout(start=np.asarray(start, np.float32), discs=_regions(self))  # type: ignore[arg-type]
 
 
-def _inside(discs: jax.Array, position: jax.Array) -> jax.Array:
+def _inside(discs: Float32[Array, "3 P K"], position: Float32[Array, " 2"]) -> Bool[Array, " P"]:
     """The propositions that hold at a position ``[2]``, bool ``[P]``."""
     # Sums of products and few discs in turn: a reduction would leave the compiler's fast path for loops.
     dx, dy, radius = discs[0] - position[0], discs[1] - position[1], discs[2]
@@ -288,7 +300,7 @@ def _inside(discs: jax.Array, position: jax.Array) -> jax.Array:
     return functools.reduce(jnp.logical_or, [within[:, k] for k in range(within.shape[1])])
 
 
-def _labels(discs: Any, places: np.ndarray) -> np.ndarray:
+def _labels(discs: Float[Array, "3 P K"], places: Float[np.ndarray, "*lead 2"]) -> Bool[np.ndarray, "*lead P"]:
     """The propositions that hold at places ``[..., 2]``, bool ``[..., P]``, in double precision."""
     x, y, radius = np.asarray(discs, np.float64)
     distance = np.hypot(x - places[..., None, None, 0], y - places[..., None, None, 1])
@@ -298,7 +310,7 @@ def _labels(discs: Any, places: np.ndarray) -> np.ndarray:
 
 
 @functools.cache
-def _regions(env: Walk) -> np.ndarray:
+def _regions(env: Walk) -> Float32[np.ndarray, "3 P K"]:
     """The environment's discs, float32 ``[3, P, K]``."""
     grouped = [[disc[1:] for disc in env.discs if disc[0] == name] for name in env.propositions]
     discs = np.full((3, len(grouped), max(map(len, grouped))), NO_DISC, np.float32)
@@ -318,7 +330,7 @@ def _regions(env: Walk) -> np.ndarray:
     raise ValueError(f"no random layout of {MOST_DRAWS} lets every region be reached over free ground and hold alone")
 
 
-def _all_alone(env: Walk, discs: np.ndarray) -> bool:
+def _all_alone(env: Walk, discs: Float[np.ndarray, "3 P K"]) -> bool:
     """Whether from every start each proposition can be had alone, with room to stand, over ground without any."""
     start = (env.low, env.low) if env.start is None else env.start
     labels, inside, place = env.grid(WalkLayout(start=np.asarray(start), discs=discs))  # type: ignore[arg-type]

@@ -11,7 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Bool, Float, Int, Key
 
+from envs_jax.arrays import Array
 from envs_jax.zone.layouts import COLOURS, MOST_DRAWS, NUM_ZONES, SPAWN, ZONE_KEEPOUT, ZONES_EACH, ZoneLayout
 
 ROBOT_WITHIN = 0.3
@@ -44,19 +46,19 @@ _NOWHERE = 1e6
 class _Core:
     """What the contest is about."""
 
-    robot: jax.Array  # [2]
-    better: jax.Array  # [2], of the first colour
-    nearer: jax.Array  # [2], of the first colour
-    goal: jax.Array  # [2], of the second colour
+    robot: Float[Array, "*lead 2"]
+    better: Float[Array, "*lead 2"]  # of the first colour
+    nearer: Float[Array, "*lead 2"]  # of the first colour
+    goal: Float[Array, "*lead 2"]  # of the second colour
 
 
 def contested_layout(
-    key: jax.Array,
-    first: jax.Array | int,
-    second: jax.Array | int,
+    key: Key[Array, ""],
+    first: Int[Array, ""] | int,
+    second: Int[Array, ""] | int,
     *,
-    mirrored: jax.Array | bool = False,
-    needed: jax.Array | bool = True,
+    mirrored: Bool[Array, ""] | bool = False,
+    needed: Bool[Array, ""] | bool = True,
 ) -> ZoneLayout:
     """A random contested layout, or with the same key its mirrored control. The key is consumed.
 
@@ -72,7 +74,7 @@ def contested_layout(
         ``zones[second, 0]`` the goal; so the nearer zone of the first colour is number 1, or 0 on the control.
     """
 
-    def attempt(carry: tuple[jax.Array, _Core, jax.Array, jax.Array]) -> tuple[jax.Array, _Core, jax.Array, jax.Array]:
+    def attempt(carry: tuple[Array, _Core, Array, Array]) -> tuple[Array, _Core, Array, Array]:
         key, core_key, rest_key = jax.random.split(carry[0], 3)
         core, found = _draw_core(core_key)
         rest, placed = _draw_rest(rest_key, core)
@@ -94,12 +96,12 @@ def contested_layout(
     return ZoneLayout(robot=jnp.concatenate([core.robot, heading[None]]), zones=zones)
 
 
-def _draw_core(key: jax.Array) -> tuple[_Core, jax.Array]:
+def _draw_core(key: Key[Array, ""]) -> tuple[_Core, Bool[Array, ""]]:
     """Robot, goal and the two zones of the first colour, and whether a valid draw was found (bool ``[]``)."""
     # All numbers in one draw, for one call of the generator: it is what drawing a layout costs.
     unit = jax.random.uniform(key, (_GEOMETRIES, 7))
 
-    def between(column: int, limits: tuple[float, float]) -> jax.Array:
+    def between(column: int, limits: tuple[float, float]) -> Float[Array, "..."]:
         return limits[0] + (limits[1] - limits[0]) * unit[:, column]
 
     robot = ROBOT_WITHIN * (2 * unit[:, :2] - 1)
@@ -123,7 +125,7 @@ def _draw_core(key: jax.Array) -> tuple[_Core, jax.Array]:
     return jax.tree.map(lambda x: x[best], core), valid.any()
 
 
-def _draw_rest(key: jax.Array, core: _Core) -> tuple[jax.Array, jax.Array]:
+def _draw_rest(key: Key[Array, ""], core: _Core) -> tuple[Float[Array, "..."], Bool[Array, ""]]:
     """The other zone of the second colour and those of the other two colours ``[5, 2]``, and whether all found a place.
 
     They keep away from the first zones' reflections as well, so that a contested layout and its control share them.
@@ -132,7 +134,9 @@ def _draw_rest(key: jax.Array, core: _Core) -> tuple[jax.Array, jax.Array]:
     core_zones = jnp.stack([core.goal, core.better, core.nearer, near, far])
     draws = jax.random.uniform(key, (_REST, MOST_DRAWS, 2), minval=-_REACH, maxval=_REACH)
 
-    def place(placed: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+    def place(
+        placed: Float[Array, "objects 2"], inputs: tuple[Array, Array]
+    ) -> tuple[Float[Array, "objects 2"], tuple[Array, Array]]:
         index, candidates = inputs
         free = (index > 0) | _is_contested(core, candidates)
         for zones in (placed, core_zones):
@@ -147,10 +151,10 @@ def _draw_rest(key: jax.Array, core: _Core) -> tuple[jax.Array, jax.Array]:
     return rest, found.all()
 
 
-def _is_contested(core: _Core, other_goal: jax.Array) -> jax.Array:
+def _is_contested(core: _Core, other_goal: Float[Array, "... 2"]) -> Bool[Array, "..."]:
     """Whether the better zone makes the whole way shorter here and on the control; bool ``[...]`` for ``[..., 2]``."""
 
-    def way(over: jax.Array) -> jax.Array:
+    def way(over: Float[Array, "... 2"]) -> Float[Array, "..."]:
         onward = jnp.minimum(_distance(over, core.goal), _distance(over, other_goal))
         return _distance(core.robot, over) + onward
 
@@ -158,18 +162,20 @@ def _is_contested(core: _Core, other_goal: jax.Array) -> jax.Array:
     return (way(core.better) + LEAST_DETOUR <= way(core.nearer)) & (way(near) + LEAST_DETOUR <= way(far))
 
 
-def _reflected(core: _Core) -> tuple[jax.Array, jax.Array]:
+def _reflected(core: _Core) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """The first zones of the control: the nearer one, now on the goal's side, and the other."""
     return 2 * core.robot - core.nearer, 2 * core.robot - core.better
 
 
-def _distance(left: jax.Array, right: jax.Array) -> jax.Array:
+def _distance(left: Float[Array, "... 2"], right: Float[Array, "... 2"]) -> Float[Array, "..."]:
     # Not as a sum over the last axis: short reductions are slow on a CPU.
     dx, dy = left[..., 0] - right[..., 0], left[..., 1] - right[..., 1]
     return jnp.sqrt(dx * dx + dy * dy)
 
 
-def _distance_to_way(points: jax.Array, start: jax.Array, end: jax.Array) -> jax.Array:
+def _distance_to_way(
+    points: Float[Array, "... 2"], start: Float[Array, "... 2"], end: Float[Array, "... 2"]
+) -> Float[Array, "..."]:
     """Distance of points ``[..., 2]`` from a straight way."""
     along, offset = end - start, points - start
     projected = offset[..., 0] * along[0] + offset[..., 1] * along[1]

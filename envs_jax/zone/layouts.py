@@ -9,6 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Bool, Float, Int32, Key
+
+from envs_jax.arrays import Array
 
 COLOURS = ("blue", "green", "red", "yellow")
 ZONES_EACH = 2
@@ -36,22 +39,22 @@ class ZoneLayout:
         zones: float ``[P, Z, 2]``, centres of the zones (m).
     """
 
-    robot: jax.Array  # float [3]
-    zones: jax.Array  # float [P, Z, 2]
+    robot: Float[Array, "*lead 3"]
+    zones: Float[Array, "*lead P Z 2"]
 
 
 @struct.dataclass
 class _Draw:
     """A layout in the making: robot first, then zones in order."""
 
-    key: jax.Array
-    placed: jax.Array  # float [1 + P·Z, 2]
-    count: jax.Array  # int32 [], objects placed
-    draws: jax.Array  # int32 [], draws made for the next one
-    done: jax.Array  # bool []
+    key: Key[Array, "*lead"]
+    placed: Float[Array, "*lead _ 2"]
+    count: Int32[Array, "*lead"]  # objects placed
+    draws: Int32[Array, "*lead"]  # draws made for the next one
+    done: Bool[Array, "*lead"]
 
 
-def new_layout(key: jax.Array, layout: ZoneLayout, needed: jax.Array) -> ZoneLayout:
+def new_layout(key: Key[Array, ""], layout: ZoneLayout, needed: Bool[Array, ""]) -> ZoneLayout:
     """A random layout other than ``layout`` where ``needed`` (bool ``[]``), else ``layout``. The key is consumed.
 
     Objects are placed in order, each at the first of at most ``MOST_DRAWS`` uniform draws that keeps its distance from
@@ -74,7 +77,7 @@ def new_layout(key: jax.Array, layout: ZoneLayout, needed: jax.Array) -> ZoneLay
     return jax.tree.map(lambda new, old: jnp.where(needed, new, old.astype(dtype)), fresh, layout)
 
 
-def _place_next(draw: _Draw, previous: jax.Array) -> _Draw:
+def _place_next(draw: _Draw, previous: Float[Array, "objects 2"]) -> _Draw:
     """One block of draws for the next object."""
     index = np.arange(1 + NUM_ZONES)
     key, draw_key = jax.random.split(draw.key)

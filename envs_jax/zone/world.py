@@ -14,7 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Bool, Float, Float32, Int32, Key, Shaped
 
+from envs_jax.arrays import Array
 from envs_jax.base import Box, ContestedChoice, Drawable, EnvParams, Reflections, StepResult, Symmetric
 from envs_jax.scenes import DiscScene, Region
 from envs_jax.zone import physics as zone_physics
@@ -43,11 +45,11 @@ class ZoneState:
         time: int32 ``[]``, steps taken.
     """
 
-    body: jax.Array  # float [6]
-    sensors: jax.Array  # float [12]
-    vanished: jax.Array  # bool [P]
+    body: Float[Array, "*lead 6"]
+    sensors: Float[Array, "*lead 12"]
+    vanished: Bool[Array, "*lead P"]
     layout: ZoneLayout
-    time: jax.Array  # int32 []
+    time: Int32[Array, "*lead"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,17 +119,24 @@ class Zone(Symmetric, ContestedChoice, Drawable):
         """Forward force and turn."""
         return Box(low=-1.0, high=1.0, shape=(2,))
 
-    def sample_layout(self, key: jax.Array, params: EnvParams) -> ZoneLayout:
+    def sample_layout(self, key: Key[Array, ""], params: EnvParams) -> ZoneLayout:
         """A random layout: robot and zones apart, see `envs_jax.zone.layouts.new_layout`."""
         return self.resample_layout(key, _no_layout(), jnp.bool_(True), params)
 
-    def resample_layout(self, key: jax.Array, layout: ZoneLayout, needed: jax.Array, params: EnvParams) -> ZoneLayout:
+    def resample_layout(
+        self, key: Key[Array, ""], layout: ZoneLayout, needed: Bool[Array, ""], params: EnvParams
+    ) -> ZoneLayout:
         """A random layout other than ``layout`` where ``needed``, else ``layout``."""
         del params
         return new_layout(key, layout, needed)
 
     def contested_layout(
-        self, key: jax.Array, first: jax.Array, second: jax.Array, params: EnvParams, mirrored: jax.Array | bool = False
+        self,
+        key: Key[Array, ""],
+        first: Bool[Array, " P"],
+        second: Bool[Array, " P"],
+        params: EnvParams,
+        mirrored: Bool[Array, ""] | bool = False,
     ) -> ZoneLayout:
         """A layout on which going to the nearest zone first makes the whole way longer. The key is consumed.
 
@@ -184,7 +193,7 @@ class Zone(Symmetric, ContestedChoice, Drawable):
         names = itertools.permutations(COLOURS, 2)
         return tuple((COLOURS.index(a), COLOURS.index(b)) for a, b in names if (a, b) not in self.vanishing)
 
-    def instance_at(self, state: ZoneState, goal: jax.Array) -> jax.Array:
+    def instance_at(self, state: ZoneState, goal: Bool[Array, " P"]) -> Int32[Array, ""]:
         """Which zone of a colour (``goal``, one-hot bool ``[P]``) the robot is nearest to, int32 ``[]``."""
         zones = state.layout.zones[jnp.argmax(goal)]
         dx, dy = zones[:, 0] - state.body[0], zones[:, 1] - state.body[1]
@@ -203,7 +212,9 @@ class Zone(Symmetric, ContestedChoice, Drawable):
         if (np.abs(layout.zones) > BOUNDARY).any():
             raise ValueError(f"a zone lies outside the square ±{BOUNDARY}")
 
-    def reset_to(self, layout: ZoneLayout, key: jax.Array, params: EnvParams) -> tuple[jax.Array, ZoneState]:
+    def reset_to(
+        self, layout: ZoneLayout, key: Key[Array, ""], params: EnvParams
+    ) -> tuple[Float32[Array, "..."], ZoneState]:
         """Starts at rest in a given layout."""
         del key
         layout = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), layout)
@@ -216,7 +227,9 @@ class Zone(Symmetric, ContestedChoice, Drawable):
         )
         return self.observation(state, params), state
 
-    def step_env(self, key: jax.Array, state: ZoneState, action: jax.Array, params: EnvParams) -> StepResult:
+    def step_env(
+        self, key: Key[Array, ""], state: ZoneState, action: Float[Array, " A"], params: EnvParams
+    ) -> StepResult:
         """20 ms of physics; see :meth:`Environment.step_env`. Actions are clipped to [-1, 1]."""
         del key
         control = jnp.clip(jnp.asarray(action, state.body.dtype), -1.0, 1.0)
@@ -234,12 +247,12 @@ class Zone(Symmetric, ContestedChoice, Drawable):
         truncated = state.time >= params.horizon
         return self.observation(state, params), state, reward, terminated, truncated, {}
 
-    def labels(self, state: ZoneState, params: EnvParams) -> jax.Array:
+    def labels(self, state: ZoneState, params: EnvParams) -> Bool[Array, " P"]:
         """The colours of the zones the robot's origin is in, bool ``[P]``."""
         del params
         return self._touched(state.body, state.layout.zones) & ~state.vanished
 
-    def observation(self, state: ZoneState, params: EnvParams) -> jax.Array:
+    def observation(self, state: ZoneState, params: EnvParams) -> Float32[Array, "..."]:
         """Sensors, lidar and, without solid walls, the wall sensor: float ``[80]`` or ``[76]``."""
         del params
         lidar = jnp.where(state.vanished[:, None], 0.0, lidar_readings(state.body, state.layout.zones, self.gain))
@@ -249,7 +262,9 @@ class Zone(Symmetric, ContestedChoice, Drawable):
             parts.append(jnp.exp(-jnp.abs(state.body[np.array([0, 1, 0, 1])] - sides)))
         return jnp.concatenate(parts)
 
-    def proposition_view(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def proposition_view(
+        self, observation: Float32[Array, "..."]
+    ) -> tuple[Float32[Array, "P ..."], Float32[Array, " F0"]]:
         """Each colour's lidar, float ``[P, L]``, and the other readings scaled to about one, ``[16]`` or ``[12]``."""
         end = NUM_SENSORS + len(COLOURS) * LIDAR_BINS
         lidar = observation[NUM_SENSORS:end].reshape(len(COLOURS), LIDAR_BINS)
@@ -264,7 +279,7 @@ class Zone(Symmetric, ContestedChoice, Drawable):
         ]
         return DiscScene(tuple(regions), -BOUNDARY, BOUNDARY)
 
-    def position(self, state: ZoneState) -> jax.Array:
+    def position(self, state: ZoneState) -> Shaped[Array, " _"]:
         """The robot, float ``[3]``: x, y (m) and heading (rad)."""
         return state.body[:3]
 
@@ -272,12 +287,12 @@ class Zone(Symmetric, ContestedChoice, Drawable):
     def _physics_step(self) -> zone_physics.Step:
         return zone_physics.step_function(self.physics, walls=self.walls)
 
-    def _touched(self, body: jax.Array, zones: jax.Array) -> jax.Array:
+    def _touched(self, body: Float[Array, " 6"], zones: Float[Array, "P Z 2"]) -> Bool[Array, " P"]:
         """Whether the robot's origin lies in a zone of each colour, bool ``[P]``."""
         dx, dy = zones[..., 0] - body[0], zones[..., 1] - body[1]
         return (jnp.sqrt(dx * dx + dy * dy) <= self.radius).any(-1)
 
-    def _vanished(self, vanished: jax.Array, touched: jax.Array) -> jax.Array:
+    def _vanished(self, vanished: Bool[Array, " P"], touched: Bool[Array, " P"]) -> Bool[Array, " P"]:
         """Colours gone after the robot has touched these, bool ``[P]``."""
         touched = touched & ~vanished
         for first, second in self.vanishing:
@@ -286,7 +301,7 @@ class Zone(Symmetric, ContestedChoice, Drawable):
         return vanished
 
 
-def lidar_readings(body: jax.Array, zones: jax.Array, gain: float) -> jax.Array:
+def lidar_readings(body: Float[Array, " 6"], zones: Float[Array, "P Z 2"], gain: float) -> Float[Array, "..."]:
     """What the lidar of each colour sees, float ``[P, L]``.
 
     A zone at distance d fills the bin its bearing lies in with ``exp(-gain · d)``, the next one with the share of the
