@@ -18,7 +18,6 @@ from hrlspec.methods import METHODS
 from hrlspec.presets import PRESETS, Recipe, preset
 from hrlspec.spec import TaskTree
 
-
 QUICK = {("letter", "hrlspec"), ("walk", "hrlspec"), ("zone", "hrlspec")}
 CASES = [
     pytest.param(name, recipe, method, marks=() if (name, recipe) in QUICK else pytest.mark.slow)
