@@ -166,8 +166,8 @@ def table(demo: Demo, shown: dict[str, Shown]) -> Table:
         episodes = some.episodes
         steps = episodes.steps[episodes.success].mean() if episodes.success.any() else float("nan")
         result.add_row(method, f"{episodes.success.mean():.3f}", f"{steps:.1f}", f"{episodes.returns.mean():.2f}")
-    for name, steps in ways(demo, shown).items():
-        result.add_row(name, "1.000", f"{steps.mean():.1f}", "1.00")
+    for name, each in ways(demo, shown).items():
+        result.add_row(name, "1.000", f"{each.mean():.1f}", "1.00")
     return result
 
 
