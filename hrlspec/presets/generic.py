@@ -8,7 +8,9 @@ import jax
 import numpy as np
 
 from envs_jax import Box, Environment
-from hrlspec.evaluation import Suite, make_cases, suite_from_trees
+from hrlspec.evaluation import Suite, suite_from_trees
+from hrlspec.evaluation.cases import LAYOUTS_PER_TASK, draw_layouts, task_of
+from hrlspec.exact.steps import step_solver
 from hrlspec.presets.preset import Preset
 from hrlspec.presets.recipes import Recipe, Settings, continuous
 from hrlspec.presets.suite_rules import DAG, draw_suite, seed_of_suite
@@ -51,7 +53,7 @@ def unseen_tasks(env: Environment, seed: int) -> str:
 
     200 tasks of depth 2, 3 and 4; fewer where P is so small that there are few, of each depth at most a quarter of
     those there are. Tasks of one sub-task are never among them. With one proposition there is only one task, which
-    cannot be kept from training: the suite is that task. Where there is an exact solver, tasks that can hardly ever be
+    cannot be kept from training: the suite is that task. Where there is an exact solver, tasks that can rarely be
     satisfied within the horizon are left out.
 
     Raises:
@@ -63,18 +65,19 @@ def unseen_tasks(env: Environment, seed: int) -> str:
     rule = dataclasses.replace(DAG, scarce=True)
     rng = np.random.default_rng([seed, seed_of_suite(env.name, "dag")])
     trees = draw_suite(rng, rule, env.num_propositions, np.zeros(0, np.uint32), where)
-    suite = suite_from_trees("dag", trees, env.propositions)
-    formulas = [suite.formulas[row] for row in range(len(suite)) if _possible(env, suite.take([row]))]
-    if not formulas:
-        raise ValueError(f"{env.name}: none of {len(suite)} random tasks can be satisfied within {env.horizon} steps")
+    suite = _possible(env, suite_from_trees("dag", trees, env.propositions))
     about = f"{rule.about}; fewer of a depth where there are few"
-    return commented([f"{where}: {len(formulas)} unseen tasks, drawn with seed {seed}", about], formulas)
+    return commented([f"{where}: {len(suite)} unseen tasks, drawn with seed {seed}", about], suite.formulas)
 
 
-def _possible(env: Environment, task: Suite) -> bool:
-    """Whether there are layouts enough to evaluate on, as far as that is known."""
-    try:
-        make_cases(env, task)
-    except ValueError:
-        return False
-    return True
+def _possible(env: Environment, suite: Suite) -> Suite:
+    """The tasks that can be satisfied within the horizon in a third of all layouts, as far as that is known."""
+    solve = step_solver(env, draw_layouts(env, suite, LAYOUTS_PER_TASK))
+    if solve is None:
+        return suite
+    starts = np.arange(len(suite)) * LAYOUTS_PER_TASK
+    steps = [solve(slice(at, at + LAYOUTS_PER_TASK), task_of(suite, row)).optimum for row, at in enumerate(starts)]
+    possible = (np.array(steps) <= env.horizon).mean(-1) >= 1 / 3
+    if not possible.any():
+        raise ValueError(f"{env.name}: none of {len(suite)} random tasks can be satisfied within {env.horizon} steps")
+    return suite.take(np.flatnonzero(possible))

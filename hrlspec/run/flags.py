@@ -9,12 +9,13 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
+import tyro
+
 from hrlspec.config import ConfigError
 from hrlspec.run.errors import UserError
 
 Flags = TypeVar("Flags")
 
-_FRAME = " │╭╮╰╯─\n"
 _SETTING = re.compile(r"(?:Error parsing (\S+): )?([A-Z]\w*)\.([\w.]+)(?= is )")
 
 
@@ -31,13 +32,9 @@ def parse_flags(
         about: what the help begins with, if not the dataclass's docstring.
 
     Raises:
-        UserError: a flag is unknown or its value is not allowed; with the reason.
+        UserError: a flag is unknown or its value is not allowed; the message says why.
         SystemExit: with status 0, after ``--help`` was printed.
     """
-    try:
-        import tyro
-    except ImportError as error:
-        raise UserError('the command lines need the extra "cli": pip install "hrlspec[cli]"') from error
     options: dict[str, Any] = {"args": list(argv), "prog": program, "config": (tyro.conf.FlagCreatePairsOff,)}
     if default is not None:
         options["default"] = default
@@ -48,8 +45,7 @@ def parse_flags(
     except SystemExit as stop:
         if not stop.code:
             raise
-        reason = in_flags(_first_block(said.getvalue()), flags() if default is None else default)
-        raise UserError(f"{reason} (see {program} --help)") from None
+        raise UserError(f"{in_flags(_reason(said.getvalue()), default)} (see {program} --help)") from None
     return parsed
 
 
@@ -58,8 +54,8 @@ def in_flags(message: str | ConfigError, flags: Any) -> str:
 
     Args:
         message: as the settings say it, or as the parser does, which tells where they are.
-        flags: a dataclass of flags, where settings of that name are looked for. Where there are several the message
-            stays as it is.
+        flags: a dataclass of flags, where settings of that name are looked for unless the message tells. Where there
+            are several it stays as it is.
     """
     found = _SETTING.match(str(message))
     if found is None:
@@ -67,7 +63,7 @@ def in_flags(message: str | ConfigError, flags: Any) -> str:
     where, kind, name = found.groups()
     places = [place for place, some in _settings(flags) if type(some).__name__ == kind]
     if where is not None:
-        place = "" if where == type(flags).__name__ else where.replace("-", "_")
+        place = "" if where == kind else where.replace("-", "_")  # flags themselves are called by their class
     elif len(places) == 1:
         (place,) = places
     else:
@@ -77,22 +73,25 @@ def in_flags(message: str | ConfigError, flags: Any) -> str:
     return f"--{flag}{str(message)[found.end() :]}"
 
 
-def _settings(flags: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+def _settings(flags: object, place: str = "") -> Iterator[tuple[str, Any]]:
     """All dataclasses within a dataclass, itself included, under dotted names."""
-    yield place, flags
-    for field in dataclasses.fields(flags):
-        value = getattr(flags, field.name)
-        if dataclasses.is_dataclass(value):
-            yield from _settings(value, f"{place}.{field.name}".lstrip("."))
+    if dataclasses.is_dataclass(flags):
+        yield place, flags
+        for field in dataclasses.fields(flags):
+            yield from _settings(getattr(flags, field.name), f"{place}.{field.name}".lstrip("."))
 
 
-def _first_block(text: str) -> str:
-    """What a framed message says, without the frame, its title, and what comes after the first rule."""
-    lines: list[str] = []
+def _reason(text: str) -> str:
+    """What the parser's message says: not its title nor what comes after it, without frame or, in ASCII, rules."""
+    blocks: list[list[str]] = [[]]
     for line in text.splitlines():
-        content = line.strip(_FRAME)
-        if content and not line.startswith(("╭", "╰")):
-            lines.append(content)
-        elif lines:
-            break
-    return " ".join(lines) or "the arguments cannot be understood"
+        content = line.strip(" │")
+        if content.startswith(("╭", "╰")):
+            continue
+        if content.strip("-─"):
+            blocks[-1].append(content)
+        else:
+            blocks.append([])
+    said = [" ".join(block) for block in blocks if block]
+    title = 0 if "╭" in text else 1  # a framed title stands in the frame
+    return said[title] if len(said) > title else "the arguments cannot be understood"

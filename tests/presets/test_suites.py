@@ -2,32 +2,38 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import shutil
 
 import numpy as np
 import pytest
 
-import envs_jax
 from hrlspec.evaluation import suite_from_text
-from hrlspec.presets import suites
-from hrlspec.presets.suites import FOLDER, RECIPES, generate, load_suite, reserved_hashes, suite_names
+from hrlspec.presets import PRESETS, Preset, preset, suites
+from hrlspec.presets.demos import ROOMS
+from hrlspec.presets.suites import FOLDER, SuiteError, hashes_text, packaged_suite, suite_texts
+from hrlspec.run.commands import suites as command
 from hrlspec.run.errors import UserError
 from hrlspec.spec import task_hashes
 from hrlspec.tasks.sampling import sample_trees
 
-ALL = [(env_name, name) for env_name in RECIPES for name in RECIPES[env_name]]
+ALL = [(some.name, name) for some in PRESETS.values() for name in some.suites]
 
 
-@pytest.mark.parametrize("env_name", RECIPES)
-def test_the_files_are_what_the_generator_draws(env_name):
-    for name, text in generate(env_name).items():
-        assert (FOLDER / env_name / f"{name}.txt").read_bytes() == text.encode(), name
+def propositions(some: Preset) -> tuple[str, ...]:
+    return some.make().propositions
+
+
+@pytest.mark.parametrize("some", PRESETS.values(), ids=PRESETS)
+def test_the_files_are_what_the_generator_draws(some):
+    for name, text in suite_texts(some.name, some.suites, propositions(some)).items():
+        assert (FOLDER / some.name / f"{name}.txt").read_bytes() == text.encode(), name
 
 
 def _tree(env_name: str, name: str, row: int) -> dict[int, tuple[int, frozenset[int], frozenset[int]]]:
     """Edges of one task: node -> (parent, reach, avoid)."""
-    trees = load_suite(env_name, name).trees
+    trees = preset(env_name).suite(name).trees
     return {
         int(node): (
             int(trees.parent[row, node]),
@@ -63,7 +69,7 @@ def _children(edges: dict[int, tuple[int, frozenset[int], frozenset[int]]], node
 
 @pytest.mark.parametrize(("env_name", "name"), ALL)
 def test_rules(env_name, name):
-    suite = load_suite(env_name, name)
+    suite = preset(env_name).suite(name)
     assert len(suite) == 200
     fewest, most = {"reach_avoid_6": (1, 2), "reach_avoid": (1, 2), "reach_12": (0, 0), "reach": (0, 0)}.get(
         name, (0, 2)
@@ -128,17 +134,17 @@ def _canonical(edges: dict[int, tuple[int, frozenset[int], frozenset[int]]], nod
     return tuple(sorted(below))
 
 
-@pytest.mark.parametrize("env_name", RECIPES)
-def test_no_task_twice_and_all_of_them_reserved(env_name):
-    names = suite_names(env_name)
-    assert len({_canonical(_tree(env_name, name, row)) for name in names for row in range(200)}) == 200 * len(names)
-    hashes = np.concatenate([load_suite(env_name, name).hashes for name in names])
-    assert len(set(hashes.tolist())) == 200 * len(names)
-    reserved = reserved_hashes(env_name)
-    assert reserved.dtype == np.uint32
+@pytest.mark.parametrize("some", PRESETS.values(), ids=PRESETS)
+def test_no_task_twice_and_all_of_them_reserved(some):
+    names = some.suite_names
+    number = 200 * len(names)
+    assert len({_canonical(_tree(some.name, name, row)) for name in names for row in range(200)}) == number
+    hashes = np.concatenate([some.suite(name).hashes for name in names])
+    assert len(set(hashes.tolist())) == number
+    assert some.reserved.dtype == np.uint32
     # What is kept in the file is still in force, or every run would compile all formulas at its start.
-    assert (FOLDER / env_name / "reserved.hex").read_text().split()[0] == suites._fingerprint(env_name)
-    np.testing.assert_array_equal(reserved, np.sort(hashes))
+    assert (FOLDER / some.name / "reserved.hex").read_text() == hashes_text(some.name, names, propositions(some))
+    np.testing.assert_array_equal(some.reserved, np.sort(hashes))
 
 
 def test_samplers_reject_what_is_reserved():
@@ -168,47 +174,65 @@ def test_samplers_reject_what_is_reserved():
     assert not np.isin(task_hashes(again), reserved).any()
 
 
+@pytest.fixture
+def no_memory():
+    """Suites are read again, before and after."""
+    for known in (suites.packaged_suite, suites.packaged_hashes):
+        known.cache_clear()
+    yield
+    for known in (suites.packaged_suite, suites.packaged_hashes):
+        known.cache_clear()
+
+
+@pytest.mark.usefixtures("no_memory")
 def test_reserved_hashes_follow_the_files(tmp_path, monkeypatch):
     shutil.copytree(FOLDER, tmp_path / "suites")
     monkeypatch.setattr(suites, "FOLDER", tmp_path / "suites")
     path = tmp_path / "suites" / "letter" / "dag.txt"
     path.write_text("achieve a; achieve b; achieve a; achieve b\n")
-    load_suite.cache_clear()
-    reserved_hashes.cache_clear()
-    try:
-        added = suite_from_text("one", path.read_text(), envs_jax.make("letter").propositions).hashes
-        reserved = reserved_hashes("letter")
-        assert np.isin(added, reserved).all()
-        assert len(reserved) == 601
-        path.unlink()
-        reserved_hashes.cache_clear()
-        with pytest.raises(UserError, match=r"cannot read .*dag\.txt.*python -m experiments\.suites"):
-            reserved_hashes("letter")
-    finally:
-        load_suite.cache_clear()
-        reserved_hashes.cache_clear()
+    letter = dataclasses.replace(preset("letter"))  # which remembers nothing
+    added = suite_from_text("one", path.read_text(), propositions(letter)).hashes
+    assert np.isin(added, letter.reserved).all()
+    assert len(letter.reserved) == 601
+    path.unlink()
+    suites.packaged_hashes.cache_clear()
+    with pytest.raises(SuiteError, match=r"cannot read .*dag\.txt.*hrlspec suites"):
+        _ = dataclasses.replace(letter).reserved
 
 
 def test_unknown_suites():
-    with pytest.raises(UserError, match=r"unknown suite 'dga' of 'letter'; expected one of: dag, deeper"):
-        load_suite("letter", "dga")
-    with pytest.raises(UserError, match="there is none for this environment"):
-        load_suite("desert", "dag")
-    assert reserved_hashes("desert").shape == (0,)
-    assert suite_names("desert") == ()
+    with pytest.raises(SuiteError, match=r"unknown suite 'dga' of 'letter'; expected one of: dag, deeper"):
+        preset("letter").suite("dga")
+    with pytest.raises(SuiteError, match="there is none for it"):
+        ROOMS.suite("dag")
+    assert ROOMS.reserved.shape == (0,)
+    assert ROOMS.suite_names == ()
 
 
-def test_check_says_what_is_not_as_drawn(tmp_path, monkeypatch, capsys):
+def test_suites_that_a_preset_brings_along():
+    text = "achieve blue; achieve red # a comment\nachieve red\n"
+    rooms = dataclasses.replace(ROOMS, texts={"mine": text})
+    assert rooms.suite_names == ("mine",)
+    assert rooms.suite("mine").formulas == ("achieve blue; achieve red", "achieve red")
+    # A task of one sub-task can be trained on all the same.
+    np.testing.assert_array_equal(rooms.reserved, rooms.suite("mine").hashes[:1])
+
+
+@pytest.mark.usefixtures("no_memory")
+def test_the_command_writes_and_checks(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(suites, "FOLDER", tmp_path)
-    monkeypatch.setattr(suites, "RECIPES", {"letter12": {"reach_12": RECIPES["letter12"]["reach_12"]}})
-    monkeypatch.setattr("sys.argv", ["suites"])
-    suites.main()
+    twelve = preset("letter12")
+    short = dataclasses.replace(twelve, suites={"reach_12": twelve.suites["reach_12"]})
+    monkeypatch.setattr(command, "PRESETS", {"letter12": short})
+    command.main([])
     assert "written: " in capsys.readouterr().out
     path = tmp_path / "letter12" / "reach_12.txt"
+    # Without the suites before it nothing else is drawn: their tasks are only left out.
     assert path.read_bytes() == (FOLDER / "letter12" / "reach_12.txt").read_bytes()
-    monkeypatch.setattr("sys.argv", ["suites", "--check"])
-    suites.main()
+    packaged = packaged_suite("letter12", "reach_12", propositions(twelve))
+    np.testing.assert_array_equal(short.reserved, np.sort(packaged.hashes))
+    command.main(["--check"])
     assert "as drawn: " in capsys.readouterr().out
     path.write_text("achieve a\n")
-    with pytest.raises(UserError, match=r"reach_12\.txt is not what the sampler draws"):
-        suites.main()
+    with pytest.raises(UserError, match=r"reach_12\.txt is not what the sampler draws.*`hrlspec suites`"):
+        command.main(["--check"])

@@ -13,8 +13,8 @@ import pytest
 from hrlspec import checkpoint
 from hrlspec.run.commands import evaluate
 from hrlspec.run.errors import main_guard
-from hrlspec.run.experiment import experiments_of, parse_run
 from hrlspec.run.folder import open_run
+from hrlspec.run.run_flags import experiments_of, parse_run
 
 ROOT = Path(__file__).parents[2]
 

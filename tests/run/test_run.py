@@ -23,11 +23,11 @@ from hrlspec import checkpoint
 from hrlspec.checkpoint import state_hash
 from hrlspec.run.commands import evaluate, run
 from hrlspec.run.errors import main_guard
-from hrlspec.run.experiment import experiment_of, experiments_of, parse_run
+from hrlspec.run.experiment import experiment_of
 from hrlspec.run.folder import read_metrics, read_record
 from hrlspec.run.learner import Learner
 from hrlspec.run.progress import ProgressDisplay
-from tests.experiments import tiny
+from tests.run import tiny
 
 ROOT = Path(__file__).parents[2]
 PATIENCE = 900  # seconds; a busy machine may need most of it to load the programs
@@ -62,7 +62,8 @@ def rows(folder: Path) -> list[dict[str, Any]]:
 
 def final_hash(folder: Path) -> str:
     """Of the training state in the last checkpoint."""
-    learner = Learner(experiment_of(read_record(folder)["config"], str(folder)))
+    experiment = experiment_of(read_record(folder)["config"], str(folder))
+    learner = Learner(experiment, experiment.preset)
     restored = checkpoint.load(folder / "checkpoints", learner.job().init())
     assert restored.step == tiny.TOTAL
     assert restored.skipped == ()
@@ -88,7 +89,7 @@ def test_what_a_run_leaves(finished: Path) -> None:
     assert [row["env_steps"] for row in read_metrics(finished)] == [400, 800, 960]
     for row in read_metrics(finished):
         expected = {"wall_s", "level", "eval/return_mean", "eval/success_rate", "eval/steps_mean", "eval/spl"}
-        expected |= {"train/steps_per_s", "train/success_rate", "controller/policy_loss", "planner/transe_loss"}
+        expected |= {"train/steps_per_s", "train/success_rate", "low/policy_loss", "high/transe_loss"}
         assert expected <= row.keys()
         assert 0 <= row["eval/success_rate"] <= 1
         assert row["level"] in (1, 2)
@@ -233,7 +234,7 @@ def test_parameters_that_are_not_finite_end_the_run(tmp_path: Path, monkeypatch:
         return iterate(self, state, index)
 
     def watch(self: ProgressDisplay, env_steps: int, metrics: Any) -> None:
-        skipped.append(metrics["controller/skipped"])
+        skipped.append(metrics["low/skipped"])
         advance(self, env_steps, metrics)
 
     monkeypatch.setattr(Learner, "_iterate", poisoned)
@@ -295,11 +296,55 @@ def test_a_damaged_checkpoint_is_not_evaluated_silently(
     del caplog
 
 
-def test_experiments_survive_their_record(tmp_path: Path) -> None:
-    ((experiment, folder),) = experiments_of(parse_run(tiny.arguments(tmp_path / "x", "--env", "letter12")))
-    assert folder == tmp_path / "x"
-    from hrlspec.run.folder import open_run
+# Environments and methods of somebody else's, in a module in the current directory.
+WORLD = """
+import dataclasses
+from envs_jax.rooms.world import Rooms
+from hrlspec.methods import ImplicitPlanner, Ours
 
-    with open_run(tmp_path / "x", experiment, tensorboard=False):
-        pass
-    assert experiment_of(read_record(tmp_path / "x")["config"], "x") == experiment
+def three_rooms():
+    return Rooms(horizon=40)
+
+@dataclasses.dataclass(frozen=True)
+class Patient(Ours):
+    name = "patient"
+    about = "ours, with a setting of its own"
+    patience: int = 3
+
+PATIENT = Patient(high=dataclasses.replace(ImplicitPlanner(), transe_margin=2.0))
+"""
+
+
+def test_an_environment_and_a_method_of_somebody_elses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Trained, evaluated and drawn without being registered; its tasks are those in the folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)  # and forgotten again
+    (tmp_path / "a_world.py").write_text(WORLD)
+    named = ("--env", "a_world:three_rooms", "--method", "a_world:PATIENT", "--method.patience", "5")
+    flags = tiny.arguments(Path("run"), *named)
+    assert call(*flags) == 0, capsys.readouterr().err
+    config = read_record("run")["config"]
+    assert config["method_settings"]["patience"] == 5
+    assert config["method_settings"]["high"]["transe_margin"] == 2.0
+    experiment = experiment_of(config, "run")
+    assert type(experiment.method_settings).__name__ == "Patient"
+    assert experiment.name == "a_world.three_rooms-a_world.PATIENT-hrlspec-set1-seed0"
+    summary = json.loads(Path("run/summary.json").read_text())
+    tasks = [task["task"] for task in summary["final"]["suite"]["per_task"]]
+    assert tasks == [line for line in Path("run/tasks/dag.txt").read_text().splitlines() if line[0] != "#"]
+    assert "plots/episode.gif" in summary["pictures"]
+    # The tasks are read from the folder, whatever would be drawn now.
+    Path("run/tasks/dag.txt").write_text("achieve blue; achieve red; achieve blue\n")
+    capsys.readouterr()
+    assert main_guard(lambda: evaluate.main(["--run", "run", "--suite", "dag", "--episodes", "20", "--json"])) == 0
+    (task,) = json.loads(capsys.readouterr().out)["per_task"]
+    assert task["task"] == "achieve blue; achieve red; achieve blue"
+    Path("run/summary.json").unlink()
+    assert call(*flags, "--resume") == 0
+    assert "(1 tasks, 20 episodes)" in capsys.readouterr().out
+    Path("run/tasks/dag.txt").write_bytes(b"\xff")
+    Path("run/summary.json").unlink()
+    assert call(*flags, "--resume") == 2
+    assert "no test tasks in run/tasks/dag.txt" in capsys.readouterr().err

@@ -6,29 +6,41 @@ import dataclasses
 import json
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from hrlspec.presets.settings import preset
+from hrlspec.config import evolve
+from hrlspec.methods import METHODS
+from hrlspec.presets import PRESETS, RewardSet, preset
 from hrlspec.run.commands import run
 from hrlspec.run.errors import UserError, main_guard
-from hrlspec.run.experiment import RunFlags, check_config, experiment_of, experiments_of, parse_run
+from hrlspec.run.experiment import Experiment, experiment_of
 from hrlspec.run.folder import config_hash, open_run
+from hrlspec.run.run_flags import experiments_of, parse_run
 
 ROOT = Path(__file__).parents[2]
 
 BAD_FLAGS = [
-    ("--env zones", "'zones' for argument '--env'"),
+    ("--env zones", "unknown environment 'zones', expected one of letter, letter12"),
     ("--env", "Missing value for argument '--env'"),
-    ("--method best", "'--method'"),
+    ("--env nowhere:make", "nowhere:make cannot be used: ModuleNotFoundError: No module named 'nowhere'"),
+    ("--env os:nothing", "module 'os' has no attribute 'nothing'"),
+    ("--env os:sep", "os:sep is of type str, expected an environment"),
+    ("--env math:sqrt", "math:sqrt cannot be used: TypeError: "),
+    ("--env :", "Empty module name"),
+    ("--method best", "unknown method 'best', expected one of ours, ltl2action"),
+    ("--method envs_jax:Letter", "is of type Letter, expected a value of a subclass of hrlspec.methods.Method"),
     ("--recipe secret", "'--recipe'"),
     ("--reward-set 3", "'--reward-set'"),
     ("--seed x", "--seed"),
     ("--seed -1", "--seed is -1"),
     ("--seed 1.5", "--seed"),
     ("--seed 99999999999", "--seed is 99999999999"),
-    ("--num-seeds 0", "--num-seeds is 0"),
+    ("--num-seeds 0", "--num-seeds is 0, expected at least 1"),
+    ("--seed 2147483647 --num-seeds 2", "--num-seeds is 2, expected the last seed to be at most 2147483647"),
     ("--total-steps 0", "--config.total-steps is 0"),
     ("--total-steps many", "--total-steps"),
     ("--total-steps -5", "total-steps is -5"),
@@ -42,23 +54,29 @@ BAD_FLAGS = [
     ("--config.discount 1.5", "--config.discount is 1.5"),
     ("--config.discount nan", "--config.discount is nan"),
     ("--config.network.task-scale 0", "--config.network.task-scale is 0"),
-    ("--config.shield.mode maybe", "--config.shield.mode"),
+    ("--config.shield.enabled maybe", "Unrecognized options: maybe"),
     ("--config.shield.threshold 2", "--config.shield.threshold is 2"),
     ("--config.relabel.share -0.1", "--config.relabel.share is -0.1"),
     ("--config.curriculum.levels 0", "--config.curriculum.levels is 0"),
-    ("--config.curriculum.levels 40", "--config.curriculum.max-nodes is 16, expected at least 42"),
+    ("--config.curriculum.levels 40", "--config.curriculum.max-nodes is 16, expected at least levels + 2, 42"),
     ("--config.curriculum.promotion 95", "--config.curriculum.promotion is 95"),
     ("--config.curriculum.max-nodes 3", "--config.curriculum.max-nodes is 3"),
-    ("--config.low.epochs 0", "--config.low.epochs is 0"),
-    ("--config.low.minibatches 0", "--config.low.minibatches is 0"),
-    ("--config.low.minibatches 7 --config.num-envs 64", "--config.low.minibatches is 7, expected a divisor of"),
-    ("--config.high.minibatches 1000000", "--config.high.minibatches is 1000000, expected a divisor of"),
-    ("--config.high.learning-rate -1", "--config.high.learning-rate is -1"),
-    ("--config.low.learning-rate inf", "--config.low.learning-rate is inf"),
-    ("--config.low.most-ratio 1.1", "--config.low.most-ratio is 1.1, expected a number from 1.2 to"),
+    ("--config.low.optimiser.epochs 0", "--config.low.optimiser.epochs is 0"),
+    ("--config.low.optimiser.minibatches 0", "--config.low.optimiser.minibatches is 0, expected at least 1"),
+    (
+        "--config.low.optimiser.minibatches 7",
+        "--config.low.optimiser.minibatches is 7, expected a divisor of 160",
+    ),
+    ("--method.high.ppo.optimiser.minibatches 1000", "--method.high.ppo.optimiser.minibatches is 1000, expected a div"),
+    ("--method.high.ppo.optimiser.learning-rate -1", "--method.high.ppo.optimiser.learning-rate is -1"),
+    ("--config.low.optimiser.learning-rate inf", "--config.low.optimiser.learning-rate is inf"),
+    ("--config.low.dual-clip 1.1", "--config.low.dual-clip is 1.1, expected at least 1 + clip, 1.2"),
     ("--config.network.latent 0", "--config.network.latent is 0"),
     ("--config.network.actor 64 -64", "--config.network.actor"),
     ("--config.num-evns 8", "Unrecognized options: --config.num-evns"),
+    ("--method ltl2action --method.high.transe 0", "Unrecognized options: --method.high.transe"),
+    ("--method option --no-transe", "--no-transe: the method option has no such technique"),
+    ("--method ltl2action --no-max-operator", "--no-max-operator: the method ltl2action has no such technique"),
     ("--evaluation.every 0", "--evaluation.every is 0"),
     ("--evaluation.episodes 15", "--evaluation.episodes is 15"),
     ("--evaluation.contested 7", "--evaluation.contested is 7"),
@@ -109,56 +127,77 @@ def test_bad_input(
 
 
 def test_bad_input_in_a_process_of_its_own(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "experiments.run", "--out", str(tmp_path / "x"), "--config.shield.mode", "maybe"]
+    command = [sys.executable, "-m", "experiments.run", "--out", str(tmp_path / "x"), "--seed", "-1"]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (2, "", 1)
-    assert ended.stderr.startswith("error: invalid choice 'maybe' for argument '--config.shield.mode'")
+    assert ended.stderr == (
+        "error: --seed is -1, expected a number from 0 to 2147483647 (see python -m experiments.run --help)\n"
+    )
     assert not (tmp_path / "x").exists()
 
 
-def test_help_shows_the_preset_of_the_chosen_recipe(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        parse_run(["--recipe", "paper", "--help"])
-    assert stop.value.code == 0
-    out = capsys.readouterr().out
+def test_help_shows_the_settings_of_what_was_chosen(capsys: pytest.CaptureFixture[str]) -> None:
+    def shown(*flags: str) -> str:
+        with pytest.raises(SystemExit) as stop:
+            parse_run([*flags, "--help"], program="hrlspec run")
+        assert stop.value.code == 0
+        return " ".join(capsys.readouterr().out.split())
+
+    out = shown("--recipe", "paper")
+    assert out.startswith("usage: hrlspec run ")
+    for said in (*PRESETS, *(f"{method.name}: {method.about}" for method in METHODS.values())):
+        assert said in out
+    assert "any other as --env module:factory" in out
+    assert "any other as --method module:VALUE" in out
     assert "--config.relabel.share" in out
     assert "--no-shield" in out
+    assert "--method.high.transe" in out
+    option = shown("--method", "option")
+    assert "--method.high.fading" in option
+    assert "--method.high.transe" not in option
 
 
 @pytest.mark.parametrize(("env", "steps"), [("letter", 1), ("walk", 6), ("zone", 6)])
 def test_how_near_the_shield_lets_one_come(env: str, steps: int) -> None:
     """The reach critic's value k steps from a region is discount^(k - 1)."""
-    shield = preset(env, "paper", 1, "ours").shield
+    shield = preset(env).settings("ours", "paper")[0].shield
     assert shield.discount ** (steps - 1) > shield.threshold > shield.discount**steps
 
 
 @pytest.mark.parametrize("env", ["letter", "letter12", "walk", "zone"])
 @pytest.mark.parametrize("recipe", ["paper", "hrlspec"])
-@pytest.mark.parametrize("method", ["ours", "ltl2action", "option", "myopic-low", "no-er"])
-def test_every_preset_is_accepted(env: str, recipe: str, method: str) -> None:
-    for reward_set in (1, 2):
+@pytest.mark.parametrize("method", METHODS)
+def test_every_preset_is_accepted(env: str, recipe: Any, method: str) -> None:
+    reward_sets: tuple[RewardSet, ...] = (1, 2)
+    for reward_set in reward_sets:
         flags = ["--env", env, "--recipe", recipe, "--method", method, f"--reward-set={reward_set}"]
         parsed = parse_run(flags)
-        assert parsed.config == preset(env, recipe, reward_set, method)
+        assert (parsed.config, parsed.method_settings) == preset(env).settings(method, recipe, reward_set)
         ((experiment, folder),) = experiments_of(parsed)
         assert str(folder) == f"runs/{env}-{method}-{recipe}-set{reward_set}-seed0"
         assert experiment_of(json.loads(json.dumps(dataclasses.asdict(experiment))), "here") == experiment
 
 
 def test_switches_and_overrides() -> None:
-    def config_of(*flags: str) -> object:
-        return experiments_of(parse_run(flags))[0][0].config
+    def made(*flags: str) -> Experiment:
+        return experiments_of(parse_run(flags))[0][0]
 
-    plain = parse_run([]).config
-    assert config_of() == plain
-    assert config_of("--no-max-operator") == dataclasses.replace(plain, max_operator=False)
-    assert config_of("--no-transe") == dataclasses.replace(plain, transe=0.0)
-    assert config_of("--no-shield") == dataclasses.replace(plain, shield=dataclasses.replace(plain.shield, mode="off"))
-    assert config_of("--no-relabel") == config_of("--config.relabel.share", "0")
-    assert config_of("--total-steps", "7") == config_of("--config.total-steps", "7")
-    everything = config_of("--no-curriculum").curriculum  # type: ignore[attr-defined]
-    assert everything.promotion == everything.window == 0
-    assert everything.earlier == pytest.approx(1 - 1 / everything.levels)
+    plain = made()
+    assert (plain.config, plain.method_settings) == preset("letter").settings()
+
+    def changed(config: Mapping[str, Any], high: Mapping[str, Any]) -> Experiment:
+        method = plain.method_settings.replace(**high)
+        return dataclasses.replace(plain, config=evolve(plain.config, config), method_settings=method)
+
+    assert made("--no-shield", "--recipe", "paper").config.shield.enabled is False
+    assert made("--no-max-operator", "--recipe", "paper").method_settings.high.max_operator is False
+    assert made("--no-transe") == changed({}, {"transe": 0.0})
+    assert made("--no-relabel") == changed({"relabel.share": 0.0}, {}) == made("--config.relabel.share", "0")
+    assert made("--total-steps", "7") == changed({"total_steps": 7}, {}) == made("--config.total-steps", "7")
+    assert made("--method.high.transe-margin", "3") == changed({}, {"transe_margin": 3.0})
+    curriculum = made("--no-curriculum").config.curriculum
+    assert curriculum.promotion == curriculum.window == 0
+    assert curriculum.earlier == pytest.approx(1 - 1 / curriculum.levels)
 
 
 def test_no_curriculum_reaches_the_last_level_at_once() -> None:
@@ -188,16 +227,19 @@ def test_records_of_other_versions_are_refused() -> None:
     ((experiment, _),) = experiments_of(parse_run([]))
     record = json.loads(json.dumps(dataclasses.asdict(experiment)))
     assert len(config_hash(record)) == 64
+    settings = record["method_settings"]
     for changed, message in [
         ({**record, "extra": 1}, "the setting 'extra'"),
         ({name: record[name] for name in record if name != "seed"}, "the setting 'seed'"),
         ({**record, "config": {**record["config"], "zeta": 1}}, "the setting 'config.zeta'"),
         ({**record, "config": 3}, "the setting 'config."),
+        ({**record, "method_settings": {**settings, "zeta": 1}}, "the setting 'method_settings.zeta'"),
+        ({**record, "method_settings": {"high": {}}}, "the setting 'method_settings.high."),
         ({**record, "seed": "0"}, "seed is '0'"),
-        ({**record, "method": "magic"}, "method is 'magic'"),
-        ({**record, "env": "nowhere"}, "unknown environment 'nowhere'"),
+        ({**record, "recipe": "stew"}, "recipe is 'stew'"),
+        ({**record, "method": "magic"}, "there is a run that cannot be read here: unknown method 'magic'"),
+        ({**record, "env": "nowhere"}, "there is a run that cannot be read here: unknown environment 'nowhere'"),
+        ({**record, "config": {**record["config"], "num_envs": 0}}, "Config.num_envs is 0, expected at least 1"),
     ]:
         with pytest.raises(UserError, match=message):
             experiment_of(changed, "there")
-    with pytest.raises(UserError, match="num-envs is 0"):
-        check_config(dataclasses.replace(RunFlags().config, num_envs=0))

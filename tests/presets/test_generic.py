@@ -1,0 +1,106 @@
+"""Environments that nobody tuned: what their settings follow from, and the tasks that they are tested on."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envs_jax import Letter, Walk
+from envs_jax.rooms.world import Rooms
+from hrlspec.evaluation import Suite, suite_from_text
+from hrlspec.presets import RECIPES, preset_for
+from hrlspec.presets.generic import unseen_tasks
+from hrlspec.presets.suite_rules import shortest
+from hrlspec.spec import task_hashes
+from hrlspec.tasks.bank import TaskBanks
+from hrlspec.tasks.sampling import sample_trees
+from tests.bare import Bare
+from tests.probes import Corridor
+
+
+def named(*names: str, horizon: int = 100) -> Any:
+    """An environment that is asked for nothing but its propositions."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Named(Bare):
+        propositions = names  # type: ignore[assignment]
+        horizon = 100  # type: ignore[assignment]
+
+    return Named(Letter())
+
+
+def suite_of(env: Any, seed: int = 0) -> Suite:
+    return suite_from_text("dag", unseen_tasks(env, seed), env.propositions)
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize("env", [Letter(), Walk(), Rooms(), Corridor()], ids=lambda env: env.name)
+def test_settings_by_spaces(env: Any, recipe: Any) -> None:
+    config, _ = preset_for(env).settings("ours", recipe)
+    assert config.discount == pytest.approx(min(max(1 - 3 / env.horizon, 0.9), 0.998))
+    assert config.curriculum.max_avoid <= max(0, env.num_propositions - 2)
+    # Coloured noise and long rollouts are for continuous actions alone.
+    small_steps = isinstance(env, Walk)
+    assert (config.noise_correlation > 0) == small_steps
+    assert (config.num_steps > 64) == small_steps
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4])
+def test_whatever_is_held_out_every_level_can_be_drawn(number: int) -> None:
+    env = named(*"abcd"[:number])
+    some = dataclasses.replace(preset_for(env), texts={"dag": unseen_tasks(env, 3)})
+    for recipe in RECIPES:
+        config, _ = some.settings("ours", recipe)
+        bank = TaskBanks(0, config.curriculum, number, some.reserved).at(0)
+        assert not np.isin(task_hashes(bank), some.reserved).any()
+
+
+def test_with_many_propositions_there_are_200_tasks() -> None:
+    suite = suite_of(named(*"abcde"))
+    assert dict(zip(*np.unique(suite.depths, return_counts=True), strict=True)) == {2: 66, 3: 67, 4: 67}
+    assert len(set(suite.hashes.tolist())) == 200
+    assert (shortest(suite.trees) >= 2).all()
+
+
+def test_with_two_at_most_a_quarter_of_what_there_is() -> None:
+    """Branches alternate between the two, so that a task is two lengths, 0 for no branch, of which one is its depth."""
+    suite = suite_of(named("left", "right"))
+    for depth in (2, 3, 4):
+        drawn = sample_trees(
+            np.random.default_rng(1),
+            num_tasks=500,
+            num_propositions=2,
+            max_nodes=16,
+            min_depth=depth,
+            max_depth=depth,
+            max_branching=3,
+        )
+        there_are = len(set(task_hashes(drawn)[shortest(drawn) >= 2].tolist()))
+        assert there_are == 2 * depth - 1
+        assert (suite.depths == depth).sum() == there_are // 4
+
+
+def test_with_one_the_only_task_is_not_held_out() -> None:
+    env = named("goal")
+    text = unseen_tasks(env, 0)
+    assert text == "# bare letter/dag: the only task there is, and so not unseen\nachieve goal\n"
+    assert dataclasses.replace(preset_for(env), texts={"dag": text}).reserved.shape == (0,)
+    assert preset_for(env).settings("ours")[0].curriculum.levels == 1
+
+
+def test_tasks_follow_the_seed() -> None:
+    env = named(*"abcde")
+    assert unseen_tasks(env, 1) == unseen_tasks(env, 1)
+    assert unseen_tasks(env, 1) != unseen_tasks(env, 2)
+
+
+def test_what_cannot_be_done_in_time_is_left_out() -> None:
+    """In Letter there is an exact solver. Four letters cannot be reached within three steps."""
+    letter = Letter(size=4, num_letters=5, num_cells=5, horizon=3)
+    assert shortest(suite_of(letter).trees).max() <= 3
+    assert shortest(suite_of(dataclasses.replace(letter, horizon=100)).trees).max() == 4
+    with pytest.raises(ValueError, match="none of 200 random tasks can be satisfied within 1 steps"):
+        unseen_tasks(dataclasses.replace(letter, horizon=1), 0)
