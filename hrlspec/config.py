@@ -235,14 +235,22 @@ def evolve(settings: S, changes: Mapping[str, Any]) -> S:
     """A copy of settings with changes, by dotted names, checked once all of them are made.
 
     ``evolve(config, {"num_envs": 64, "low.optimiser.learning_rate": 1e-3})``.
+
+    Raises:
+        ConfigError: there is no setting of that name, or a value cannot be meant.
     """
+    known = [field.name for field in dataclasses.fields(settings)] if dataclasses.is_dataclass(settings) else []
     nested: dict[str, dict[str, Any]] = {}
     for name, value in changes.items():
         first, _, rest = name.partition(".")
+        if first not in known:
+            expected = f"expected one of: {', '.join(known)}" if known else "which has none"
+            raise ConfigError(f"unknown setting {first!r} of {type(settings).__name__}, {expected}")
         nested.setdefault(first, {})[rest] = value
-    values = {
-        name: inner[""] if "" in inner else evolve(getattr(settings, name), inner) for name, inner in nested.items()
-    }
+    values = {}
+    for name, inner in nested.items():
+        whole = inner.pop("", getattr(settings, name))
+        values[name] = evolve(whole, inner) if inner else whole
     return dataclasses.replace(settings, **values)  # type: ignore[type-var]
 
 
