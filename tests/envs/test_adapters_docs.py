@@ -7,7 +7,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 
@@ -54,10 +53,24 @@ def test_its_layouts_are_checked() -> None:
         ring().check_layout(np.array([1, 1, 2]))
 
 
+SMALL = {
+    "num_envs": 8,
+    "num_steps": 16,
+    "group": 8,
+    "low.optimiser.minibatches": 2,
+    "network.latent": 16,
+    "network.encoder_mlp": (16,),
+    "curriculum.tasks_per_level": 16,
+    "curriculum.max_nodes": 6,
+}
+
+
 def test_the_rest_of_the_page_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    names = dict(world())
+    """With fewer steps and smaller sizes."""
+    names = {**world(), "SMALL": SMALL}
     for block in BLOCKS[1:]:
-        exec(compile(block, str(PAGE), "exec", dont_inherit=True), names)
-    assert capsys.readouterr().out.startswith("('achieve red',)\n")
-    assert int(names["state"].iteration) == 1
-    assert all(np.isfinite(value).all() for value in jax.tree.leaves(names["metrics"]))
+        short = block.replace("500_000", "1, changes=SMALL")
+        exec(compile(short, str(PAGE), "exec", dont_inherit=True), names)
+    subtask, success = capsys.readouterr().out.splitlines()
+    assert subtask == "('achieve red',)"
+    assert 0 <= float(success) <= 1
