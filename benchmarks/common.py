@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import importlib.metadata
 import json
 import os
@@ -120,15 +119,23 @@ def learner(name: str, recipe: Recipe) -> tuple[Trainer, Any, Any]:
     return trainer, banks.at(0), some.rewards()
 
 
+def programs(name: str, recipe: Recipe, trainer: Trainer) -> tuple[Program, Program]:
+    """The training state and an iteration, compiled as runs do."""
+    quick = preset(name).compiles_quickly(recipe)
+    init = Program("init", Trainer.init, trainer, quick=quick)
+    return init, Program("iterate", Trainer.iterate, trainer, quick=quick)
+
+
 def training(name: str, recipe: Recipe, seconds: float) -> dict[str, Any]:
     """Rollout alone, and whole iterations with every technique of the recipe, at the last curriculum level."""
     trainer, bank, machine = learner(name, recipe)
     agent, config = trainer.agent, trainer.agent.config
     reserved = jnp.zeros(1, jnp.uint32)
-    state = trainer.init(jax.random.key(0), bank, machine)
+    init, iterate = programs(name, recipe, trainer)
+    state = init(jax.random.key(0), bank, machine)
     # Some learning first: episodes of an untrained agent are longer, and have fewer decisions.
     for _ in range(30):
-        state, _ = trainer.iterate(state, bank, machine, reserved)
+        state, _ = iterate(state, bank, machine, reserved)
     result: dict[str, Any] = {}
 
     @jax.jit
@@ -140,21 +147,18 @@ def training(name: str, recipe: Recipe, seconds: float) -> dict[str, Any]:
         return collect(jax.random.key(2), setting, collector, config.noise_correlation)[0]
 
     result["rollout_steps_per_s"] = rate(roll, state.collector, config.steps_per_iteration, seconds)
-    iterate = functools.partial(_iterate, trainer, bank, machine, reserved)
-    result["training_steps_per_s"] = rate(iterate, state, config.steps_per_iteration, seconds)
+    result["training_steps_per_s"] = rate(
+        lambda state: iterate(state, bank, machine, reserved)[0], state, config.steps_per_iteration, seconds
+    )
     result["config"] = dataclasses.asdict(config)
     result["method"] = dataclasses.asdict(agent.method)
     return result
 
 
-def _iterate(trainer: Trainer, bank: Any, machine: Any, reserved: Any, state: Any) -> Any:
-    return trainer.iterate(state, bank, machine, reserved)[0]
-
-
 def start(name: str, recipe: Recipe) -> dict[str, float]:
     """Seconds that the training state took, and those that the first iteration took, in this process."""
     trainer, bank, machine = learner(name, recipe)
-    init, iterate = (Program(name, getattr(Trainer, name), trainer) for name in ("init", "iterate"))
+    init, iterate = programs(name, recipe, trainer)
     before = time.perf_counter()
     state = jax.block_until_ready(init(jax.random.key(0), bank, machine))
     between = time.perf_counter()
@@ -185,7 +189,7 @@ def main(script: str, env: str, flags: CommonFlags, measure: Callable[[], Mappin
         flags: what to measure.
         measure: the entries about the environment alone.
     """
-    prepare(env, "hrlspec" if "hrlspec" in flags.recipes else "paper")
+    prepare()
     if flags.only_start:
         print(json.dumps(start(env, flags.recipes[0])))
         return

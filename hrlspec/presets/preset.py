@@ -80,6 +80,10 @@ class Preset:
         rate = self.learning_rates.get((recipe_name, tuned), config.low.optimiser.learning_rate)
         return evolve(config, {"low.optimiser.learning_rate": rate}), chosen
 
+    def compiles_quickly(self, recipe_name: Recipe) -> bool:
+        """Whether a recipe's programs do; what surrounds the matrix products of recipe ``paper`` would be slower."""
+        return self.quick_compile and recipe_name == "hrlspec"
+
     def rewards(self, reward_set: RewardSet = 1) -> RewardMachine:
         """The rewards of a reward set: 1 for completion; in set 2 also for sub-tasks and for orders of letters."""
         propositions = self.make().propositions

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -132,11 +132,10 @@ class Learner:
             self.env, suite, num_tasks=num_tasks, episodes=settings.episodes, greedy=settings.greedy
         )
 
-    def _program(self, name: str, function: Any) -> Callable[..., Any]:
+    def _program(self, name: str, function: Any) -> Program:
         """A function of the trainer; kept from run to run unless it is made of code that others may change."""
-        if self.experiment.is_foreign:
-            return functools.partial(function, self.trainer)
-        return Program(name, function, self.trainer)
+        quick, kept = self.preset.compiles_quickly(self.experiment.recipe), not self.experiment.is_foreign
+        return Program(name, function, self.trainer, quick=quick, kept=kept)
 
     def _init(self) -> TrainState:
         key = jax.random.key(self.experiment.seed)

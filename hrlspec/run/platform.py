@@ -1,11 +1,14 @@
-"""What XLA and JAX are told before their first use. Call `prepare` when a command line knows its environment.
+"""What XLA and JAX are told before their first use, and how programs are compiled. Command lines call `prepare`.
 
-XLA reads its flags when the first array is made, so this must come before that; importing JAX is harmless.
+XLA reads its flags when the first array is made, so `prepare` must come before that; importing JAX is harmless. A flag
+that XLA does not know ends the process, and versions differ in what they know; an option of a single program that it
+does not know is an error that can be caught. So what can be an option is one.
 """
 
 from __future__ import annotations
 
 import ctypes
+import functools
 import importlib.metadata
 import os
 import sys
@@ -15,26 +18,23 @@ import jax
 
 _OPTIONS = "--xla_backend_extra_options="
 # The CPU backend folds the body of a small loop into one kernel, which makes rollouts several times faster. Up to JAX
-# 0.11 what it calls small is too small for them; from 0.12 on its own choice is better.
+# 0.11 what it calls small is too small for them; from 0.12 on its own choice is better. No option of a program says
+# this; every release of JAX 0.10 and 0.11 knows the flag.
 _SMALL_LOOPS = "xla_cpu_small_while_loop_byte_threshold"
 _SMALL_LOOPS_BYTES = 65536
 # An iteration compiles in two thirds of the time and, under recipe hrlspec, runs as fast: its time is spent in matrix
 # products, which are not compiled here. At level 0 it takes twice as long. Zone's physics is compiled here: at level 1
 # it runs at 40 % of its speed; and so is what surrounds the products of recipe paper, which runs at 80 to 85 %.
-_QUICK = {"--xla_backend_optimization_level": "1", "--xla_cpu_use_fusion_emitters": "false"}
+_QUICK: dict[str, str | bool] = {"xla_backend_optimization_level": "1", "xla_cpu_use_fusion_emitters": False}
 
 
-def prepare(env_name: str, recipe: str) -> None:
+def prepare() -> None:
     """Sets XLA's flags for this version of JAX and a compilation cache that later processes share.
-
-    ``env_name`` and ``recipe`` name the preset that will run.
 
     What the user set in ``XLA_FLAGS``, ``JAX_COMPILATION_CACHE_DIR`` and JAX's other variables stays as it is.
     """
     _keep_freed_memory()
-    flags = with_loop_option(os.environ.get("XLA_FLAGS", ""), jax.__version_info__)
-    quickly = recipe == "hrlspec" and not env_name.startswith("zone") and not _has_accelerator()
-    os.environ["XLA_FLAGS"] = compiled_quickly(flags) if quickly else flags
+    os.environ["XLA_FLAGS"] = with_loop_option(os.environ.get("XLA_FLAGS", ""), jax.__version_info__)
     if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
@@ -68,16 +68,26 @@ def with_loop_option(flags: str, version: tuple[int, ...]) -> str:
     return " ".join([*words, _OPTIONS + option])
 
 
-def compiled_quickly(flags: str) -> str:
-    """``XLA_FLAGS`` with those that make XLA compile code for the CPU in less time, unless they are there."""
-    return " ".join([*flags.split(), *(f"{name}={value}" for name, value in _QUICK.items() if name not in flags)])
+def compiler_options(*, quick: bool) -> dict[str, str | bool]:
+    """Options for ``lowered.compile``: those that the installed XLA knows and the user's ``XLA_FLAGS`` leaves open.
+
+    Args:
+        quick: whether the CPU's code is to be compiled in less time where that hardly costs speed. On other devices,
+            most code is compiled here and its speed counts, so this changes nothing there.
+    """
+    if not quick or jax.default_backend() != "cpu":
+        return {}
+    flags = os.environ.get("XLA_FLAGS", "")
+    return {name: value for name, value in _QUICK.items() if name not in flags and _is_known(name, value)}
 
 
-def _has_accelerator() -> bool:
-    """Whether JAX has a plugin for one: on a GPU most code is compiled here, and its speed counts."""
-    if os.environ.get("JAX_PLATFORMS") == "cpu":
+@functools.cache
+def _is_known(name: str, value: str | bool) -> bool:
+    try:
+        jax.jit(lambda: 0).lower().compile(compiler_options={name: value})
+    except jax.errors.JaxRuntimeError:  # no such option, or not with such a value
         return False
-    return any(importlib.metadata.entry_points(group="jax_plugins"))
+    return True
 
 
 def cache_folder() -> Path:

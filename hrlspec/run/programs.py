@@ -24,6 +24,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 import envs_jax
 import hrlspec
+from hrlspec.run.platform import compiler_options
 
 KEPT = 64
 """Programs in the folder; those used least recently go first."""
@@ -36,10 +37,13 @@ class Program:
         name: of the file.
         function: jitted, with its static arguments first.
         static: these; their ``repr`` must tell everything about them.
+        quick: compiled with those `compiler_options` that take less time.
+        kept: from one process to the next, if JAX's own cache is in use.
     """
 
-    def __init__(self, name: str, function: Any, *static: Any) -> None:
+    def __init__(self, name: str, function: Any, *static: Any, quick: bool = False, kept: bool = True) -> None:
         self._name, self._function, self._static = name, function, static
+        self._quick, self._kept = quick, kept
         self._compiled: Callable[..., Any] | None = None
 
     def __call__(self, *args: Any) -> Any:
@@ -49,23 +53,24 @@ class Program:
         return self._compiled(*args)
 
     def _find(self, args: tuple[Any, ...]) -> Callable[..., Any]:
-        folder = _folder()
+        options = compiler_options(quick=self._quick)
+        folder = _folder() if self._kept else None
         if folder is None:
-            return self._compile(args)
-        file = folder / f"{self._name}-{_digest(_fingerprint(), self._static, _described(args))}"
+            return self._lower(args).compile(options)
+        file = folder / f"{self._name}-{_digest(_fingerprint(), self._static, _described(args), options)}"
         with contextlib.suppress(Exception):  # not there, or damaged, or of another machine: it is made anew
             return _load(file, args)
-        compiled = self._compile(args)
+        lowered = self._lower(args)
+        # What comes out of JAX's cache lacks code that storing it again would need; the loss shows at the first call.
+        with _without_cache():
+            compiled = lowered.compile(options)
         with contextlib.suppress(Exception):  # no space, or a backend that cannot: the next start compiles again
             _save(file, compiled)
         return compiled
 
-    def _compile(self, args: tuple[Any, ...]) -> jax.stages.Compiled:
-        lowered = self._function.lower(*self._static, *args)
-        # What comes out of JAX's cache lacks code that storing it again would need; the loss shows at the first call.
-        with _without_cache():
-            compiled: jax.stages.Compiled = lowered.compile()
-        return compiled
+    def _lower(self, args: tuple[Any, ...]) -> jax.stages.Lowered:
+        lowered: jax.stages.Lowered = self._function.lower(*self._static, *args)
+        return lowered
 
 
 @contextlib.contextmanager

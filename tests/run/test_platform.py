@@ -1,4 +1,4 @@
-"""XLA's flags and the compilation cache: set where nothing was, and the user's left alone."""
+"""XLA's flags, its options and the compilation cache: set where nothing was, and the user's left alone."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from pathlib import Path
 import jax
 import pytest
 
-from hrlspec.run.platform import compiled_quickly, with_loop_option
+from hrlspec.run import platform
+from hrlspec.run.platform import compiler_options, with_loop_option
 
 ROOT = Path(__file__).parents[2]
 OPTION = "xla_cpu_small_while_loop_byte_threshold=65536"
@@ -36,20 +37,32 @@ def test_the_option_for_loops(flags: str, version: tuple[int, ...], expected: st
     assert with_loop_option(expected, version) == expected
 
 
-def test_the_level_of_optimisation_is_the_users_to_choose() -> None:
-    ours = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
-    assert compiled_quickly("--xla_a=1") == f"--xla_a=1 {ours}"
-    assert compiled_quickly(ours) == ours
-    mine = "--xla_cpu_use_fusion_emitters=true --xla_backend_optimization_level=3 --xla_a=1"
-    assert compiled_quickly(mine) == mine
+def test_options_are_those_that_xla_knows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XLA_FLAGS", "")
+    options = compiler_options(quick=True)
+    assert options["xla_backend_optimization_level"] == "1"
+    assert jax.jit(lambda: 2).lower().compile(options)() == 2
+    monkeypatch.setattr(platform, "_QUICK", {**platform._QUICK, "xla_no_such_option": "1", "xla_cpu_max_isa": False})
+    assert compiler_options(quick=True) == options
+
+
+def test_the_level_of_optimisation_is_the_users_to_choose(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=true --xla_backend_optimization_level=3 --xla_a=1")
+    assert compiler_options(quick=True) == {}
+
+
+def test_what_gains_from_it_is_optimised_in_full(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XLA_FLAGS", "")
+    assert compiler_options(quick=False) == {}
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert compiler_options(quick=True) == {}
 
 
 SCRIPT = """
-import os, sys
+import os
 from hrlspec.run import platform
 import jax
-before = dict(os.environ)
-platform.prepare(*sys.argv[1:])
+platform.prepare()
 import jax.numpy as jnp
 assert float(jax.jit(lambda x: x + 1)(jnp.ones(()))) == 2  # XLA knows the flags
 print(jax.config.jax_compilation_cache_dir)
@@ -58,11 +71,11 @@ print(os.environ["XLA_FLAGS"])
 """
 
 
-def prepared(env: str = "letter", recipe: str = "hrlspec", **environment: str) -> list[str]:
+def prepared(**environment: str) -> list[str]:
     names = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "XLA_FLAGS")
     clean = {name: value for name, value in os.environ.items() if name not in names}
     ended = subprocess.run(
-        [sys.executable, "-c", SCRIPT, env, recipe],
+        [sys.executable, "-c", SCRIPT],
         cwd=ROOT,
         env=clean | environment,
         capture_output=True,
@@ -79,13 +92,7 @@ def test_the_cache_belongs_to_user_and_version(tmp_path: Path) -> None:
     folder, least, flags = prepared(XDG_CACHE_HOME=str(tmp_path), JAX_PLATFORMS="cpu")
     assert folder == f"{tmp_path}/hrlspec/jaxlib-{jaxlib.version.__version__}"
     assert float(least) == 0.2
-    assert flags == compiled_quickly(with_loop_option("", jax.__version_info__))
-
-
-@pytest.mark.parametrize(("env", "recipe"), [("zone-nm", "hrlspec"), ("walk", "paper")])
-def test_what_gains_from_it_is_optimised_in_full(env: str, recipe: str) -> None:
-    *_, flags = prepared(env, recipe, JAX_PLATFORMS="cpu")
-    assert "optimization_level" not in flags
+    assert flags == with_loop_option("", jax.__version_info__)
 
 
 def test_what_the_user_set_stays(tmp_path: Path) -> None:

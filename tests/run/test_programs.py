@@ -35,10 +35,10 @@ def folder(tmp_path: Path) -> Iterator[Path]:
     jax.config.update("jax_compilation_cache_dir", before)
 
 
-def run(factor: int = 3, size: int = 4) -> float:
+def run(factor: int = 3, size: int = 4, *, quick: bool = False) -> float:
     """As a new process would; jit's own memory is emptied first."""
     jax.clear_caches()
-    result = Program("scaled", scaled, factor)({"x": jnp.ones(size)}, jax.random.key(0))
+    result = Program("scaled", scaled, factor, quick=quick)({"x": jnp.ones(size)}, jax.random.key(0))
     np.testing.assert_array_equal(result["noise"], jax.random.normal(jax.random.key(0), (2,)))
     return float(result["y"].sum())
 
@@ -54,6 +54,13 @@ def test_told_apart_by_settings_and_shapes(folder: Path) -> None:
     assert (run(), run(factor=2), run(size=5), run(factor=2, size=5)) == (12, 8, 15, 10)
     assert traced == [3, 2, 3, 2]
     assert len(list(folder.iterdir())) == 4
+
+
+def test_told_apart_by_options(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XLA_FLAGS", "")
+    assert (run(quick=True), run(), run(quick=True), run()) == (12, 12, 12, 12)
+    assert traced == [3, 3]
+    assert len(list(folder.iterdir())) == 2
 
 
 def test_told_apart_by_sources(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,6 +92,15 @@ def test_the_oldest_go_first(folder: Path, monkeypatch: pytest.MonkeyPatch) -> N
 def test_without_a_place_everything_works_as_before(folder: Path) -> None:
     jax.config.update("jax_compilation_cache_dir", None)
     assert run() == 12
+    assert not folder.exists()
+
+
+def test_kept_only_if_it_may_be(folder: Path) -> None:
+    for _ in range(2):
+        jax.clear_caches()
+        result = Program("scaled", scaled, 3, kept=False)({"x": jnp.ones(4)}, jax.random.key(0))
+        assert float(result["y"].sum()) == 12
+    assert traced == [3, 3]
     assert not folder.exists()
 
 

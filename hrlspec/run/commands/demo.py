@@ -31,6 +31,7 @@ from hrlspec.presets.demos import DILEMMA, ROOMS
 from hrlspec.run import platform
 from hrlspec.run.errors import UserError
 from hrlspec.run.flags import parse_flags
+from hrlspec.run.programs import Program
 from hrlspec.run.progress import ProgressDisplay
 from hrlspec.run.tables import plain_table, result_console
 from hrlspec.spec import TaskTree
@@ -109,7 +110,7 @@ def main(argv: Sequence[str], *, program: str = "hrlspec demo") -> None:
     steps = demo.steps if flags.steps is None else flags.steps
     if steps < 1:
         raise UserError(f"--steps is {steps}, expected at least 1")
-    platform.prepare("letter", "hrlspec")
+    platform.prepare()
     shown = {method: act(demo, train(demo, method, steps, flags.seed), flags.seed) for method in demo.methods}
     result_console().print(table(demo, shown))
     flags.out.mkdir(parents=True, exist_ok=True)
@@ -122,9 +123,10 @@ def train(demo: Demo, method: str, steps: int, seed: int) -> tuple[Agent, Params
     config, nothing = trainer.agent.config, np.zeros(0, np.uint32)
     banks = TaskBanks(seed, config.curriculum, demo.env.num_propositions, nothing)
     state = trainer.init(jax.random.key(seed), banks.at(0), demo.machine)
+    iterate = Program("iterate", Trainer.iterate, trainer, quick=demo.preset.compiles_quickly("hrlspec"))
     with ProgressDisplay(config.num_iterations * config.steps_per_iteration, f"{demo.env.name}, {method}") as display:
         for i in range(config.num_iterations):
-            state, metrics = trainer.iterate(state, banks.at(i), demo.machine, nothing)
+            state, metrics = iterate(state, banks.at(i), demo.machine, nothing)
             display.advance((i + 1) * config.steps_per_iteration, {k: float(v) for k, v in metrics.items()})
     params: Params = state.params
     return trainer.agent, params

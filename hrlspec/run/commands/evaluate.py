@@ -80,7 +80,7 @@ def main(argv: Sequence[str], *, program: str = "hrlspec evaluate") -> None:
     _check(flags)
     experiment = experiment_of(read_record(flags.run)["config"], str(flags.run))
     suite = tasks_of(flags, experiment)
-    platform.prepare(experiment.env, experiment.recipe)
+    platform.prepare()
     agent = experiment.agent
     params, step = load_params(agent, flags.run, flags.step)
     try:

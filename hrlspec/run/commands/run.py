@@ -41,7 +41,7 @@ def main(argv: Sequence[str], *, program: str = "hrlspec run") -> None:
     flags = parse_run(argv, program=program)
     runs = experiments_of(flags)
     resumed = _check_folders(runs, flags)
-    platform.prepare(flags.env, flags.recipe)
+    platform.prepare()
     console = result_console()
     summaries = [
         _run(experiment, folder, resume, flags, console)
