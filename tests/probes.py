@@ -180,9 +180,7 @@ def small_planner(**changes: Any) -> ImplicitPlanner:
     return evolve(planner, {name.replace("__", "."): value for name, value in changes.items()})
 
 
-def small_agent(
-    env: Environment, config: Config | None = None, method: Method | None = None, **planner: Any
-) -> Agent:
+def small_agent(env: Environment, config: Config | None = None, method: Method | None = None, **planner: Any) -> Agent:
     """An agent of the paper's method, or of another, with small settings."""
     return Agent(env, config or small_config(), method or Ours(high=small_planner(**planner)))
 

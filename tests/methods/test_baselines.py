@@ -12,41 +12,39 @@ import pytest
 
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.networks.controller import Instruction
-from hrlspec.config import Config
 from hrlspec.learning.train import Trainer
-from hrlspec.methods import option as options
-from hrlspec.methods.option import FADING, Measurements
+from hrlspec.methods import METHODS, option
+from hrlspec.methods.option import Measurements
 from hrlspec.spec import TaskState, TaskTree, initial, open_edges
 from hrlspec.tasks.curriculum import draw_bank
 from hrlspec.tasks.rewards import Bonus, reward_machine
-from tests.probes import Corridor, on_device, padded, quick_jit, random_params, small_config
+from tests.probes import Corridor, on_device, padded, quick_jit, random_params, small_agent, small_config
 from tests.trees import random_tree, tree_of
 
 ENV = Corridor()
 P = 4
-GAMMA = 0.9
+GAMMA, FADING = 0.9, option.LogicValueIteration().fading
 
 
-def baseline(method: str, **changes: Any) -> Config:
-    config = small_config(max_operator=False, **changes)
-    if method == "option":
-        return dataclasses.replace(config, options=True, future_embedding=False)
-    network = dataclasses.replace(config.network, roles=False, whole_task=True)
-    return dataclasses.replace(config, network=network)
+def baseline(name: str, **changes: Any) -> Agent:
+    method = METHODS[name]
+    config = small_config(**changes)
+    # As it is trained, but with the small networks, and Option with its roles.
+    return Agent(ENV, config if name == "option" else method.configure(config), method)
 
 
 def told(agent: Agent, params: Any, tree: TaskTree, state: TaskState, edge: int) -> Instruction:
     tree = on_device(tree)
-    book = agent.instruct(params, tree)
+    book = agent.low.instruct(params, tree)
     feasible = open_edges(tree, state)
-    return agent.told_now(params, book, (), jnp.int32(edge), feasible, book.ahead[edge])
+    return agent.low.told_now(params, book, (), jnp.int32(edge), feasible, book.ahead[edge])
 
 
 def behaviour(agent: Agent, params: Any, tree: TaskTree, state: TaskState, edge: int) -> np.ndarray:
     """What describes the low level's policy, and its value, in three cells."""
     instruction = told(agent, params, tree, state, edge)
     views = ENV.view_at(np.array([1, 2, 3]))
-    outputs, value = jax.vmap(agent.control, (None, 0, None))(params, views, instruction)
+    outputs, value = jax.vmap(agent.low.control, (None, 0, None))(params, views, instruction)
     return np.concatenate([outputs, value[:, None]], 1)
 
 
@@ -59,20 +57,20 @@ LATER_AVOID = tree_of([(0, "a", "c"), (1, "b", "d")], num_propositions=P, num_no
 
 
 def test_an_option_knows_its_own_goal_and_what_to_avoid_and_nothing_else() -> None:
-    agent = Agent(ENV, baseline("option"))
+    agent = baseline("option")
     params = random_params(agent, 0)
     here = behaviour(agent, params, FIRST, initial(FIRST), 1)
     np.testing.assert_array_equal(here, behaviour(agent, params, OTHER_FUTURE, initial(FIRST), 1))
     for other in (OTHER_GOAL, OTHER_AVOID):
         assert np.abs(here - behaviour(agent, params, other, initial(FIRST), 1)).max() > 1e-3
-    ours = Agent(ENV, small_config())
+    ours = small_agent(ENV)
     mine = behaviour(ours, random_params(ours, 0), FIRST, initial(FIRST), 1)
     theirs = behaviour(ours, random_params(ours, 0), OTHER_FUTURE, initial(FIRST), 1)
     assert np.abs(mine - theirs).max() > 1e-3
 
 
 def test_a_flat_policy_sees_the_whole_task_and_no_sub_task() -> None:
-    agent = Agent(ENV, baseline("ltl2action"))
+    agent = baseline("ltl2action")
     params = random_params(agent, 0)
     here = behaviour(agent, params, FIRST, initial(FIRST), TaskTree.ROOT)
     for other in (OTHER_FUTURE, OTHER_GOAL, OTHER_AVOID, LATER_AVOID):
@@ -82,7 +80,7 @@ def test_a_flat_policy_sees_the_whole_task_and_no_sub_task() -> None:
 
 
 def test_a_flat_policy_sees_what_remains_of_its_task() -> None:
-    agent = Agent(ENV, baseline("ltl2action"))
+    agent = baseline("ltl2action")
     params = random_params(agent, 0)
     tree = tree_of([(0, "a", ""), (0, "b", "c"), (2, "d", "a"), (2, "a", "")], num_propositions=P)
     rest = tree_of([(0, "d", "a"), (0, "a", "")], num_propositions=P)
@@ -130,7 +128,7 @@ def plain_value(known: Measurements, tree: TaskTree, node: int) -> float:
 
 def test_logic_value_iteration() -> None:
     rng = np.random.default_rng(0)
-    values = quick_jit(options.values)
+    values = quick_jit(option.values)
     for _ in range(100):
         tree, known = random_tree(rng, num_nodes=8, num_propositions=P, most_together=2), random_measurements(rng)
         tree = padded(tree, 8)
@@ -142,9 +140,9 @@ def test_logic_value_iteration() -> None:
 
 def test_what_was_never_tried_stays_worth_a_try() -> None:
     """However long ago its only, imagined attempt was."""
-    faded = jax.tree.map(jnp.zeros_like, options.unmeasured(P))
+    faded = jax.tree.map(jnp.zeros_like, option.unmeasured(P))
     tree = on_device(FIRST)
-    assert np.isfinite(np.asarray(options.values(faded, tree, initial(tree)))[1])
+    assert np.isfinite(np.asarray(option.values(faded, tree, initial(tree)))[1])
 
 
 def test_measurements_are_sums_over_attempts_that_fade() -> None:
@@ -154,42 +152,45 @@ def test_measurements_are_sums_over_attempts_that_fade() -> None:
     goal = np.eye(P, dtype=bool)[rng.integers(P, size=shape)]
     ended, reached, last = rng.random((3, *shape)) < 0.6
     duration, reward = rng.integers(1, 9, shape), rng.normal(size=shape).astype(np.float32)
-    known = options.measure(options.unmeasured(P), origin, goal, ended, reached, last, duration, reward, discount=GAMMA)
+    known = option.measure(
+        option.unmeasured(P), origin, goal, ended, reached, last, duration, reward, discount=GAMMA, fading=FADING
+    )
     for g in range(P):
         here = ended & goal[..., g]
         for o in range(P + 1):
             ours = here & origin[..., o]
-            np.testing.assert_allclose(known.attempts[o, g], FADING + ours.sum())
+            np.testing.assert_allclose(known.attempts[o, g], FADING + ours.sum(), rtol=1e-5)
             won = (GAMMA**duration)[ours & reached].sum()
             np.testing.assert_allclose(known.discounted[o, g], FADING + won, rtol=1e-5)
         for kind in (0, 1):
             mine = here & reached & (last == kind)
-            np.testing.assert_allclose(known.successes[kind, g], FADING + mine.sum())
-            np.testing.assert_allclose(known.rewards[kind, g], reward[mine].sum(), rtol=1e-4, atol=1e-5)
+            np.testing.assert_allclose(known.successes[kind, g], FADING + mine.sum(), rtol=1e-5)
+            np.testing.assert_allclose(known.rewards[kind, g], reward[mine].sum(), rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("method", ["option", "ltl2action"])
 def test_baselines_train_in_the_same_loop(method: str) -> None:
     """A corridor with the start in the middle: each baseline learns to go to what it is told."""
-    config = baseline(method, total_steps=60 * 32 * 24)
-    trainer = Trainer(Agent(ENV, config))
+    agent = baseline(method, total_steps=60 * 32 * 24)
+    trainer, config = Trainer(agent), agent.config
     machine = reward_machine(ENV.propositions, bonuses=[Bonus("a", "b", 2.0)])
     bank = draw_bank(np.random.default_rng(0), config.curriculum, 2, np.zeros(0, np.uint32))
     wide = lambda x: np.pad(x, ((0, 0), (0, 0), (0, P - 2)))  # noqa: E731
     bank = dataclasses.replace(bank, reach=wide(bank.reach), avoid=wide(bank.avoid))
     state = trainer.init(jax.random.key(0), bank, machine)
-    planner = jax.tree.map(np.asarray, state.params["planner"])
     rates = []
     for _ in range(60):
         state, metrics = trainer.iterate(state, bank, machine, np.zeros(0, np.uint32))
         rates.append(float(metrics["successes"] / metrics["episodes"]))
-    assert np.mean(rates[-5:]) > 0.9 > rates[0] + 0.2
-    jax.tree.map(np.testing.assert_array_equal, planner, jax.tree.map(np.asarray, state.params["planner"]))
+    # Over 20 seeds at three instruction sets: in the end 1.000 in every one, at first 0.63 ± 0.05 (standard deviation).
+    assert np.mean(rates[-5:]) > 0.9 > rates[0] + 0.05
+    assert "high" not in state.optimisers  # nothing of the high level is learned by gradient
     if method == "option":
-        known = state.params["options"]
-        # a is in cell 0 and b in cell 4: from one to the other it takes four steps.
+        known = state.params["high"]
+        # a is in cell 0 and b in cell 4: from one to the other it takes four steps. Found: γ^4 less 0.0024 ± 0.0007.
         per_attempt = np.asarray(known.discounted / known.attempts)
-        assert GAMMA**7 < per_attempt[0, 1] <= GAMMA**4 + 1e-3
-        assert per_attempt[P, 0] > per_attempt[1, 0]
-        # b as the last sub-task earns 1, and 3 after a; what is known is one figure for both.
-        assert 1.0 < (known.rewards / known.successes)[1, 1] < 3.0
+        assert GAMMA**5 < per_attempt[0, 1] <= GAMMA**4 + 1e-3
+        # Starts lie nearer: found 0.154 ± 0.003.
+        assert per_attempt[P, 0] > per_attempt[1, 0] + 0.05
+        # b as the last sub-task earns 1, and 3 after a; what is known is one figure for both: found 2.45 ± 0.02.
+        assert 1.5 < (known.rewards / known.successes)[1, 1] < 2.8
