@@ -41,7 +41,7 @@ BAD_FLAGS = [
     ("--seed 99999999999", "--seed is 99999999999"),
     ("--num-seeds 0", "--num-seeds is 0, expected at least 1"),
     ("--seed 2147483647 --num-seeds 2", "--num-seeds is 2, expected the last seed to be at most 2147483647"),
-    ("--total-steps 0", "--config.total-steps is 0"),
+    ("--total-steps 0", "--total-steps is 0, expected at least 1"),
     ("--total-steps many", "--total-steps"),
     ("--total-steps -5", "total-steps is -5"),
     ("--checkpoint-minutes -1", "--checkpoint-minutes is -1"),

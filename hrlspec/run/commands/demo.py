@@ -23,13 +23,12 @@ from envs_jax.rooms.world import fewest_steps
 from hrlspec import compile_task, parse
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.low_level import Params
-from hrlspec.config import evolve
+from hrlspec.config import Checked, evolve, setting
 from hrlspec.evaluation.episodes import Episodes, Trace, trace_episodes
 from hrlspec.learning.train import Trainer
 from hrlspec.presets import Preset, RewardSet
 from hrlspec.presets.demos import DILEMMA, ROOMS
 from hrlspec.run import platform
-from hrlspec.run.errors import UserError
 from hrlspec.run.flags import parse_flags
 from hrlspec.run.programs import Program
 from hrlspec.run.progress import ProgressDisplay
@@ -43,13 +42,13 @@ LAYOUTS = 200
 
 
 @dataclasses.dataclass(frozen=True)
-class DemoFlags:
+class DemoFlags(Checked):
     """Trains each method on one of the paper's motivating examples and draws what it does."""
 
     world: tyro.conf.Positional[Literal["rooms", "dilemma"]]
     """rooms: a key to think of; dilemma: a reward to do without."""
-    seed: int = 0
-    steps: int | None = None
+    seed: int = setting(0, least=0, most=2**31 - 1)
+    steps: int | None = setting(None, least=1)
     """Environment steps of each method; 0.6 M in rooms and 1 M in dilemma if not given."""
     out: Path = Path("runs")
     """Folder for the picture."""
@@ -108,8 +107,6 @@ def main(argv: Sequence[str], *, program: str = "hrlspec demo") -> None:
     flags = parse_flags(DemoFlags, argv, program=program)
     demo = DEMOS[flags.world]
     steps = demo.steps if flags.steps is None else flags.steps
-    if steps < 1:
-        raise UserError(f"--steps is {steps}, expected at least 1")
     platform.prepare()
     shown = {method: act(demo, train(demo, method, steps, flags.seed), flags.seed) for method in demo.methods}
     result_console().print(table(demo, shown))

@@ -17,7 +17,9 @@ import numpy as np
 from hrlspec import checkpoint
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.low_level import Params
-from hrlspec.evaluation import Suite, evaluate_suite, suite_from_text
+from hrlspec.api import TrainedAgent, evaluate
+from hrlspec.config import Checked, setting
+from hrlspec.evaluation import Suite, suite_from_text
 from hrlspec.evaluation.suite import MAX_NODES
 from hrlspec.run import platform
 from hrlspec.run.errors import UserError
@@ -32,7 +34,7 @@ _LARGEST_FILE = 1_000_000  # bytes
 
 
 @dataclasses.dataclass(frozen=True)
-class EvaluateFlags:
+class EvaluateFlags(Checked):
     """Reports success, return, steps and SPL of a trained agent on the given tasks, in layouts drawn at random.
 
     Exactly one of --spec, --spec-file and --suite says which tasks.
@@ -46,9 +48,9 @@ class EvaluateFlags:
     """A file with one task a line; # begins a comment."""
     suite: str | None = None
     """A test suite of the run's environment, such as dag."""
-    episodes: int = 500
+    episodes: int = setting(500, least=1, most=1_000_000)
     """In all; at least one for each task."""
-    seed: int = 0
+    seed: int = setting(0, least=0, most=2**31 - 1)
     """Of layouts and actions."""
     step: int | None = None
     """The checkpoint to load; the newest if not given."""
@@ -56,7 +58,7 @@ class EvaluateFlags:
     """Take the most likely action and sub-task instead of sampling."""
     shield: bool = False
     """Replace actions that would step on forbidden propositions."""
-    max_nodes: int = MAX_NODES
+    max_nodes: int = setting(MAX_NODES, least=2, most=4096)
     """Largest task tree."""
     draw: Path | None = None
     """A picture (.png or .svg) of one episode of each task, of the first nine."""
@@ -84,13 +86,11 @@ def main(argv: Sequence[str], *, program: str = "hrlspec evaluate") -> None:
     agent = experiment.agent
     params, step = load_params(agent, flags.run, flags.step)
     try:
-        result = evaluate_suite(
+        result = evaluate(
             jax.random.fold_in(jax.random.key(flags.seed), 1),
-            agent,
-            params,
-            experiment.rewards,
+            TrainedAgent(agent, params, experiment.rewards),
             suite,
-            layouts_per_task=-(-flags.episodes // len(suite)),
+            episodes=flags.episodes,
             seed=flags.seed,
             greedy=flags.greedy,
             shield=flags.shield,
@@ -170,6 +170,3 @@ def _check(flags: EvaluateFlags) -> None:
         raise UserError(f"expected exactly one of --spec, --spec-file and --suite, found {found}")
     if flags.draw is not None and flags.draw.suffix not in (".png", ".svg"):
         raise UserError(f"--draw {flags.draw}: expected a file that ends in .png or .svg")
-    for name, low, high in (("episodes", 1, 1_000_000), ("seed", 0, 2**31 - 1), ("max_nodes", 2, 4096)):
-        if not low <= getattr(flags, name) <= high:
-            raise UserError(f"--{name.replace('_', '-')} is {getattr(flags, name)}, expected {low} to {high}")
