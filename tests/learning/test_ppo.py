@@ -35,7 +35,7 @@ def test_normalise_uses_the_masked_samples_alone() -> None:
 def test_relative_advantages_count_per_unit_of_what_was_expected() -> None:
     advantage, value = jnp.array([1.0, -1.0, 10.0]), jnp.array([0.5, -1.5, 9.5])
     scaled = ppo.scaled(advantage, value, PPOConfig(advantage_scale=0.5))
-    np.testing.assert_allclose(scaled, [1.0, -0.5, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(scaled, [1.0, -0.5, 1.0], rtol=1e-5)
     np.testing.assert_array_equal(ppo.scaled(advantage, value, PPOConfig()), advantage)
 
 
@@ -47,7 +47,7 @@ def test_policy_loss_equals_a_plain_reading() -> None:
     for i in np.flatnonzero(mask):
         ratio = np.exp(new[i] - old[i])
         total += min(ratio * advantage[i], min(max(ratio, 0.8), 1.2) * advantage[i])
-    assert float(ppo.policy_loss(new, old, advantage, mask, SETTINGS)) == pytest.approx(-total / mask.sum(), rel=1e-5)
+    assert float(ppo.policy_loss(new, old, advantage, mask, SETTINGS)) == pytest.approx(-total / mask.sum(), abs=1e-5)
 
 
 @pytest.mark.parametrize(("shift", "advantage", "moves"), [(0, 1, 1), (1, 1, 0), (-1, 1, 1), (1, -1, 1), (-1, -1, 0)])
@@ -85,14 +85,14 @@ def test_masked_samples_with_senseless_log_probabilities_do_no_harm() -> None:
 
 def test_annealing() -> None:
     for progress, value in ((0, 1.0), (0.5, 0.75), (1, 0.5), (3, 0.5)):
-        assert float(annealed(1.0, 0.5, jnp.float32(progress))) == pytest.approx(value)
+        assert float(annealed(1.0, 0.5, jnp.float32(progress))) == pytest.approx(value, rel=1e-5)
 
 
 def test_entropy_weighs_more_the_more_of_it_is_missing() -> None:
     settings = PPOConfig(entropy=0.2, final_entropy=0.0, entropy_floor=0.5, final_entropy_floor=0.1)
     slope = jax.grad(ppo.entropy_loss)
     plain = PPOConfig(entropy=0.2, final_entropy=0.0)
-    assert float(slope(jnp.float32(-3.0), plain, jnp.float32(0.5))) == pytest.approx(-0.1)
+    assert float(slope(jnp.float32(-3.0), plain, jnp.float32(0.5))) == pytest.approx(-0.1, rel=1e-5)
     for progress, entropy, weight in (
         (0, 0.7, 0.2),
         (0, 0.4, 0.2 + 0.2),
@@ -101,7 +101,7 @@ def test_entropy_weighs_more_the_more_of_it_is_missing() -> None:
         (1, 0, 0.2),
     ):
         found = float(slope(jnp.float32(entropy), settings, jnp.float32(progress)))
-        assert found == pytest.approx(-weight, abs=1e-6)
+        assert found == pytest.approx(-weight, abs=1e-5)
 
 
 def step(loss: Any, params: Any, clip: float = 1.0) -> Any:
@@ -112,7 +112,7 @@ def step(loss: Any, params: Any, clip: float = 1.0) -> Any:
 def test_gradient_step_descends() -> None:
     params, state, metrics = step(lambda p: ((p["x"] ** 2).sum(), {"m": p["x"].sum()}), {"x": jnp.array([3.0, -4.0])})
     np.testing.assert_allclose(params["x"], [2.9, -3.9], atol=1e-4)  # Adam's first step has the learning rate's length
-    assert float(metrics["grad_norm"]) == pytest.approx(10)
+    assert float(metrics["grad_norm"]) == pytest.approx(10, rel=1e-5)
     assert (float(metrics["m"]), float(metrics["skipped"])) == (-1, 0)
     # What Adam remembers is the clipped gradient: (0.6, -0.8), times 1 - b1.
     moments = [x for x in jax.tree.leaves(state) if x.shape == (2,)]

@@ -278,7 +278,7 @@ def test_visits_in_hindsight() -> None:
     taken = np.arange(len(seen)) == 4
     reach, avoid = (labels & taken[:, None]), np.zeros_like(labels)
     avoid[4] = [True, False, False, False, False]
-    slot = np.array([0] * 10 + [1])
+    slot = np.array([0] * 10 + [1], np.int32)
     found = visits(Record(slot=slot, labels=labels, edge_taken=taken, reach=reach, avoid=avoid))
     goals = ["".join(letter for letter, wanted in zip(LETTERS, row, strict=True) if wanted) for row in found.reach]
     assert goals == ["", "b", "", "", "c", "", "", "", "d", "", "a"]

@@ -187,7 +187,8 @@ def test_labels_replay_through_the_monitor() -> None:
             assert tree.parent[both.high.edge[s, e]] == node
             assert both.high.edge[s, e] not in blocked
             before = node
-            node, blocked, status = read_monitor(tree, node, blocked, pairs(both.outcome.labels[s, e]), both.high.edge[s, e])
+            labels, edge = pairs(both.outcome.labels[s, e]), both.high.edge[s, e]
+            node, blocked, status = read_monitor(tree, node, blocked, labels, edge)
             assert (both.outcome.node[s, e], both.outcome.edge_taken[s, e]) == (node, node != before)
             assert both.outcome.satisfied[s, e] == (status == "satisfied")
             assert both.outcome.terminated[s, e] == (status != "running")
@@ -307,9 +308,16 @@ def test_cut_episodes_bootstrap_with_the_state_they_were_cut_in(book: TaskBook, 
     blocked = np.zeros_like(t.state.blocked)
     for s, e in np.ndindex(T, E):
         tree = tree_of_row(book, t.task[s, e])
-        arguments = int(t.state.node[s, e]), pairs(t.state.blocked[s, e]), pairs(t.outcome.labels[s, e]), int(t.high.edge[s, e])
+        arguments = (
+            int(t.state.node[s, e]),
+            pairs(t.state.blocked[s, e]),
+            pairs(t.outcome.labels[s, e]),
+            int(t.high.edge[s, e]),
+        )
         blocked[s, e, list(read_monitor(tree, *arguments)[1])] = True
-    _, value = plan_all(params(), flat(jax.tree.map(np.asarray, ENV.view_at(there))), trees, states(t, t.outcome.node, blocked))
+    _, value = plan_all(
+        params(), flat(jax.tree.map(np.asarray, ENV.view_at(there))), trees, states(t, t.outcome.node, blocked)
+    )
     value = np.asarray(value).reshape(T, E)
     for bootstrap in (t.bootstrap.low, t.bootstrap.high):
         np.testing.assert_allclose(bootstrap[t.outcome.truncated], value[t.outcome.truncated], atol=1e-5)

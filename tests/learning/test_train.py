@@ -13,13 +13,14 @@ import pytest
 
 from hrlspec import checkpoint
 from hrlspec.agent.agent import Agent
+from hrlspec.agent.low_level import LowLevel
 from hrlspec.checkpoint.leaves import state_hash
-from hrlspec.config import PPOConfig
+from hrlspec.config import ConfigError, OptimiserConfig, PPOConfig, evolve
 from hrlspec.evaluation.episodes import run_episodes
-from hrlspec.learning import ppo
-from hrlspec.learning import train as training
-from hrlspec.learning.rollout import Trajectory
+from hrlspec.learning.optimiser import gradient_step, optimiser
+from hrlspec.learning.reach import ReachBatch, reach_loss
 from hrlspec.learning.train import Trainer, TrainState
+from hrlspec.methods import Ours
 from hrlspec.spec import TaskTree, initial
 from hrlspec.tasks.rewards import RewardMachine, reward_machine
 from tests.probes import (
@@ -30,23 +31,18 @@ from tests.probes import (
     probe_task,
     quick_jit,
     random_params,
+    small_agent,
     small_config,
+    small_planner,
 )
 
 # a at 0, b at 4, c at 5; episodes start at 1, 2 or 3.
 ENV = Corridor()
 CONFIG = small_config(
-    network=dataclasses.replace(
-        small_config().network,
-        latent=32,
-        encoder_mlp=(64,),
-        planner_hidden=32,
-        planner_features=32,
-        critic=(64,),
-        actor=(64,),
-    )
+    total_steps=120 * 32 * 24,
+    network=dataclasses.replace(small_config().network, latent=32, encoder_mlp=(64,), critic=(64,), actor=(64,)),
 )
-TRAINER = Trainer(Agent(ENV, CONFIG))
+TRAINER = Trainer(small_agent(ENV, CONFIG, network__hidden=32, network__features=32))
 GAMMA = CONFIG.discount
 TASKS = ("a or b", "b or a", "achieve a", "a ensuring not b", "(a or b); c", "a; b", "a or b")
 ITERATIONS = CONFIG.num_iterations
@@ -129,11 +125,11 @@ def test_updates_that_are_not_finite_are_skipped_and_counted(bad: float) -> None
     kept, _ = iterate(fresh(), 1)
     after, (metrics,) = iterate(kept, 1, completion=bad)
     assert metrics["successes"] > 0
-    for name in ("controller", "planner"):
+    for name in ("low", "high"):
         assert metrics[f"{name}/skipped"] > 0
         assert all(np.isfinite(x).all() for x in jax.tree.leaves((after.params[name], after.optimisers[name])))
     if np.isnan(bad):  # NaN is everywhere, infinity only where a task was completed
-        for name in ("controller", "planner"):
+        for name in ("low", "high"):
             assert metrics[f"{name}/skipped"] == 1
             for part in ("params", "optimisers"):
                 assert state_hash(getattr(after, part)[name]) == state_hash(getattr(kept, part)[name])
@@ -158,9 +154,10 @@ def test_first_episodes_are_staggered() -> None:
 
 
 def test_rows_that_do_not_divide_are_refused() -> None:
-    config = dataclasses.replace(CONFIG, low=PPOConfig(minibatches=7))
-    with pytest.raises(ValueError, match="48 rows do not divide into 7 minibatches"):
-        jax.eval_shape(Trainer(Agent(ENV, config)).iterate, fresh(), bank(), machine(), NOTHING_RESERVED)
+    with pytest.raises(ConfigError, match="minibatches is 7, expected a divisor of 48"):
+        evolve(CONFIG, {"low.optimiser.minibatches": 7})
+    with pytest.raises(ConfigError, match="minibatches is 7, expected a divisor of 192"):
+        small_agent(ENV, CONFIG, ppo__optimiser__minibatches=7)
 
 
 # --- What is learned ---
@@ -198,7 +195,7 @@ def test_greedy_episodes_are_as_short_as_can_be(name: str, best: dict[int, int])
 
 
 @dataclasses.dataclass(frozen=True)
-class Obedient(Agent):
+class ObedientLow(LowLevel):
     """Walks straight to what its sub-task reaches. A low level that learns may go elsewhere when that pays more."""
 
     def control(self, params: Any, view: Any, told: Any) -> tuple[jax.Array, jax.Array]:
@@ -208,18 +205,49 @@ class Obedient(Agent):
         return jnp.where(right, 10.0, -10.0) * jnp.array([-1.0, 1.0]), super().control(params, view, told)[1]
 
 
+@dataclasses.dataclass(frozen=True)
+class Obedient(Agent):
+    """An agent whose low level does as it is told."""
+
+    @functools.cached_property
+    def low(self) -> LowLevel:
+        return ObedientLow(self.env, self.config, self.method.sees, self.high.follows_plan)
+
+
+# Only the planner's choice counts: no shield, and what the low level would learn is not used. Many decisions in each
+# iteration and much randomness at first: with less of either some seeds choose for good before they have learned to see
+# the place.
+PLANNER_CONFIG = evolve(
+    CONFIG,
+    {
+        "total_steps": 80 * CONFIG.num_envs * CONFIG.num_steps,
+        "discount": 0.8,
+        "group": CONFIG.num_envs,
+        "shield.enabled": False,
+        "relabel.share": 0.0,
+        "low": PPOConfig(optimiser=OptimiserConfig(learning_rate=0.0, epochs=1, minibatches=1)),
+        "network": dataclasses.replace(
+            CONFIG.network, latent=16, encoder_mlp=(32,), task_features=4, critic=(4,), actor=(4,)
+        ),
+    },
+)
+PLANNER = small_planner(
+    network__hidden=32,
+    network__features=16,
+    steps_per_sample=2,
+    ppo__optimiser__learning_rate=3e-3,
+    ppo__optimiser__minibatches=4,
+    ppo__entropy=1.0,
+)
+PLANNER_TRAINER = Trainer(Obedient(ENV, PLANNER_CONFIG, Ours(high=PLANNER)))
+
+
 @functools.cache
 def planner_trained() -> TrainState:
-    """120 iterations with an obedient low level and no shield, so that only the planner's choice counts."""
-    config = dataclasses.replace(
-        CONFIG,
-        shield=dataclasses.replace(CONFIG.shield, mode="off"),
-        # Faster, and in half of the seeds the choice is made for good before it has learned to see the place.
-        high=dataclasses.replace(CONFIG.high, learning_rate=1e-3),
-    )
-    trainer = Trainer(Obedient(ENV, config))
-    state, step = quick_jit(trainer.init)(jax.random.key(0), bank(), machine()), quick_jit(trainer.iterate)
-    for _ in range(120):
+    """With an obedient low level."""
+    state = quick_jit(PLANNER_TRAINER.init)(jax.random.key(0), bank(), machine())
+    step = quick_jit(PLANNER_TRAINER.iterate)
+    for _ in range(PLANNER_CONFIG.num_iterations):
         state, _ = step(state, bank(), machine(), NOTHING_RESERVED)
     return state
 
@@ -227,82 +255,83 @@ def planner_trained() -> TrainState:
 @functools.cache
 def planner_at(name: str) -> tuple[np.ndarray, np.ndarray]:
     """Probabilities ``[3, N]`` and values ``[3]`` from cells 1, 2 and 3."""
-    params, agent, tree = planner_trained().params, TRAINER.agent, on_device(task(name))
+    params, agent, tree = planner_trained().params, PLANNER_TRAINER.agent, on_device(task(name))
 
-    def one(view: Any) -> Any:
-        logits, value = agent.plan(params, view, tree, initial(tree), agent.instruct(params, tree))
-        return jax.nn.softmax(logits), value
+    @quick_jit
+    def plan(views: Any) -> Any:
+        alike = (tree, initial(tree), agent.low.instruct(params, tree))
+        alike = jax.tree.map(lambda x: jnp.stack([x] * 3), alike)
+        choice = agent.high.choose(agent.low, params, views, *alike)
+        return jax.nn.softmax(choice.logits), choice.value
 
-    return jax.tree.map(np.asarray, quick_jit(jax.vmap(one))(ENV.view_at(np.array([1, 2, 3]))))
+    return jax.tree.map(np.asarray, plan(ENV.view_at(np.array([1, 2, 3]))))
 
 
 def test_the_planner_picks_the_shorter_branch() -> None:
+    # The smallest of the seven, over 20 seeds at three instruction sets: 0.949 ± 0.032 (standard deviation), never
+    # below 0.75.
+    least = 0.6
     for name, nearest in (("a or b", 1), ("b or a", 2)):
         chosen, _ = planner_at(name)
-        assert chosen[0, nearest] > 0.8  # a is next to cell 1,
-        assert chosen[2, 3 - nearest] > 0.8  # b to cell 3
+        assert chosen[0, nearest] > least  # a is next to cell 1,
+        assert chosen[2, 3 - nearest] > least  # b to cell 3
     chosen, _ = planner_at("(a or b); c")
-    assert (chosen[:, 2] > 0.8).all()  # b lies on the way to c
+    assert (chosen[:, 2] > least).all()  # b lies on the way to c
 
 
 def test_the_planner_knows_the_values() -> None:
     """γ^(steps - 1), the return of the best branch."""
-    np.testing.assert_allclose(planner_at("achieve a")[1], GAMMA ** np.array([0, 1, 2]), atol=0.12)
-    np.testing.assert_allclose(planner_at("a or b")[1], GAMMA ** np.array([0, 1, 0]), atol=0.12)
-    np.testing.assert_allclose(planner_at("(a or b); c")[1], GAMMA ** np.array([3, 2, 1]), atol=0.12)
+    # The largest error, over 20 seeds at three instruction sets: 0.034 ± 0.020, at most 0.094.
+    for name, others in (("achieve a", [0, 1, 2]), ("a or b", [0, 1, 0]), ("(a or b); c", [3, 2, 1])):
+        np.testing.assert_allclose(planner_at(name)[1], PLANNER_CONFIG.discount ** np.array(others), atol=0.15)
 
 
 @pytest.mark.slow
 def test_the_low_level_knows_the_values() -> None:
     params, agent, tree = trained()[0].params, TRAINER.agent, on_device(task("a; b"))
-    told = jax.tree.map(lambda x: x[1], agent.instruct(params, tree))
-    _, values = quick_jit(jax.vmap(lambda view: agent.control(params, view, told)))(ENV.view_at(np.array([1, 2, 3])))
-    np.testing.assert_allclose(values, GAMMA ** np.array([4, 5, 6]), atol=0.12)
+    told = jax.tree.map(lambda x: x[1], agent.low.instruct(params, tree))
+    _, values = quick_jit(jax.vmap(lambda view: agent.low.control(params, view, told)))(
+        ENV.view_at(np.array([1, 2, 3]))
+    )
+    np.testing.assert_allclose(values, GAMMA ** np.array([4, 5, 6]), atol=0.05)
 
 
 def test_the_reach_critic_learns_the_distance() -> None:
-    """V = discount^(steps - 1) of every letter from every cell, from random walks."""
-    agent = TRAINER.agent
-    settings, transform = PPOConfig(), ppo.optimiser(1.0)
-    letters, distance = ENV.table[:, :3], np.zeros((len(ENV.cells), 3))
+    """V = discount^(steps - 1) of every letter from every cell, from all steps that there are."""
+    low = TRAINER.agent.low
+    num_cells = len(ENV.cells)
+    letters, distance = ENV.table[:, :3], np.zeros((num_cells, 3))
     for cell, letter in np.ndindex(distance.shape):
         there = int(np.flatnonzero(letters[:, letter])[0])
-        at_wall = there in (0, len(ENV.cells) - 1)
+        at_wall = there in (0, num_cells - 1)
         # Standing on it, it takes a step into the wall, or one away and one back.
         distance[cell, letter] = abs(there - cell) or (1 if at_wall else 2)
-    rng = np.random.default_rng(0)
-    blank = dict.fromkeys((field for field in Trajectory.__dataclass_fields__), None)
+    here, action = np.indices((num_cells, 2), np.int32).reshape(2, 1, -1)
+    there = np.clip(here + 2 * action - 1, 0, num_cells - 1)
+    before, after = ENV.view_at(here), ENV.view_at(there)
+    transform, num_updates = optimiser(CONFIG.shield.optimiser), 2000
 
-    def walk() -> Trajectory:
-        action, here = rng.integers(2, size=(32, 16)), [rng.integers(len(ENV.cells), size=16)]
-        for a in action:
-            here.append(np.clip(here[-1] + 2 * a - 1, 0, len(ENV.cells) - 1))
-        labels, view = ENV.table[np.stack(here[1:])], ENV.view_at(np.stack(here))
-        return Trajectory(**{**blank, "labels": labels, "action": action, "view": view})
+    def best(params: Any, view: Any) -> jax.Array:
+        return low.reach_values({"reach_critic": params}, view).max(-1)
 
     @quick_jit
-    def fit(params: Any, state: Any, walks: Trajectory) -> Any:
-        def fit_one(carry: Any, trajectory: Trajectory) -> Any:
+    def fit(params: Any) -> Any:
+        def update(carry: Any, share_done: jax.Array) -> Any:
             params, state = carry
-            values = jax.vmap(jax.vmap(lambda view: agent.reach_values({"reach_critic": params}, view).max(-1)))
-            before, after = (jax.tree.map(lambda x, s=s: x[s], trajectory.view) for s in (slice(-1), slice(1, None)))
-            trajectory = trajectory.replace(view=before, reach_value=values(after))
-            batch = training.reach_batch(agent, trajectory)
+            ahead = jax.vmap(jax.vmap(functools.partial(best, params)))(after)
+            target = jnp.where(ENV.table[there], 1.0, CONFIG.shield.discount * ahead)
+            batch = ReachBatch(before, jnp.asarray(action), target)
 
             def loss(p: Any) -> Any:
-                return training.reach_loss(agent, p, batch, settings, jnp.float32(0))
+                return reach_loss(low, p, batch)
 
-            params, state, metrics = ppo.gradient_step(loss, params, state, transform, jnp.float32(0.005))
-            return (params, state), metrics["value_loss"]
+            rate = 0.02 * (1 - share_done)
+            return gradient_step(loss, params, state, transform, rate)[:2], None
 
-        return jax.lax.scan(fit_one, (params, state), walks)
+        (params, _), _ = jax.lax.scan(update, (params, transform.init(params)), jnp.arange(num_updates) / num_updates)
+        return jax.vmap(functools.partial(best, params))(ENV.view_at(np.arange(num_cells)))
 
-    walks = jax.tree.map(lambda *x: np.stack(x), *[walk() for _ in range(3000)])
-    params = random_params(agent, 0)["reach_critic"]
-    (params, _), losses = fit(params, transform.init(params), walks)
-    values = jax.vmap(lambda view: agent.reach_values({"reach_critic": params}, view).max(-1))(
-        ENV.view_at(np.arange(len(ENV.cells)))
-    )
-    np.testing.assert_allclose(np.asarray(values)[:, :3], CONFIG.shield.discount ** (distance - 1), atol=0.08)
-    assert (np.asarray(values)[:, 3] < 0.3).all()  # there is no d
-    assert losses[-1] < losses[0] / 5
+    values = np.asarray(fit(random_params(TRAINER.agent, 0)["reach_critic"]))
+    # The largest errors of 20 seeds: 0.006 ± 0.001 and, of d, 0.006 ± 0.002.
+    np.testing.assert_allclose(values[:, :3], CONFIG.shield.discount ** (distance - 1), atol=0.03)
+    assert (values[:, 3] < 0.03).all()  # there is no d
