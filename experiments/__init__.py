@@ -1,1 +1,1 @@
-"""The command lines and what they share: run folders, signals, errors."""
+"""The commands as modules; what the paper's figures are made of is in ``experiments.paper``."""
