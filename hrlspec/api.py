@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Key, Shaped, UInt32
+from jaxtyping import Float32, Key, Shaped, UInt32
 
 from envs_jax import Environment
 from envs_jax.arrays import Array
@@ -22,7 +22,6 @@ from hrlspec.agent.low_level import Params
 from hrlspec.agent.method import Method
 from hrlspec.config import evolve
 from hrlspec.evaluation import Suite, SuiteResult, evaluate_suite, suite_from_text
-from hrlspec.learning.optimiser import Metrics
 from hrlspec.learning.train import Trainer, TrainState
 from hrlspec.presets import Preset, Recipe, RewardSet, preset, preset_for
 from hrlspec.spec import TaskTree
@@ -165,7 +164,7 @@ def _init_all(trainer: Trainer, keys: Key[Array, " S"], banks: TaskTree, machine
 @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
 def _iterate_all(
     trainer: Trainer, states: TrainState, banks: TaskTree, machine: RewardMachine, reserved: UInt32[Array, " _"]
-) -> tuple[TrainState, Metrics]:
+) -> tuple[TrainState, dict[str, Float32[Array, " S"]]]:
     """`Trainer.iterate` for S seeds."""
     return jax.vmap(trainer.iterate, in_axes=(0, 0, None, None))(states, banks, machine, reserved)
 
