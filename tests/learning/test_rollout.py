@@ -6,6 +6,7 @@ import dataclasses
 import functools
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +20,7 @@ from hrlspec.agent.low_level import TaskBook
 from hrlspec.config import CurriculumConfig, RelabelConfig, evolve
 from hrlspec.learning.batch import high_batch, low_batch
 from hrlspec.learning.experience import gather
+from hrlspec.learning.reach import reach_batch
 from hrlspec.learning.rollout import Collector, Setting, collect, fill_pool
 from hrlspec.learning.train import Trainer
 from hrlspec.methods import Ours
@@ -84,6 +86,7 @@ def batches(agent: Agent, key: jax.Array, params: Any, book: TaskBook, steps: St
 
 
 @quick_jit
+@chex.assert_max_traces(n=1)
 def roll(params: Any, book: TaskBook, collector: Collector, key: jax.Array) -> Rollout:
     keys = jax.random.split(key, 3)
     pool = fill_pool(keys[0], AGENT, book, jnp.int32(LEVEL), size=12)
@@ -285,6 +288,22 @@ def test_reach_values_are_of_the_state_after_the_step(t: Step) -> None:
     goes_on = ~(t.outcome.terminated | t.outcome.truncated)[:-1]
     np.testing.assert_allclose(t.reach_value[:-1][goes_on], value[1:][goes_on], atol=1e-5)
     assert (np.abs(t.reach_value[:-1] - value[1:])[~goes_on] > 1e-3).any()
+
+
+def test_the_reach_critic_learns_from_every_transition(t: Step) -> None:
+    """1 where a letter holds after the step, else the discounted value of the next state, also where a task ends."""
+    batch = jax.tree.map(np.asarray, reach_batch(AGENT.low, on_device(t)))
+    assert batch.target.shape == (E, T, len(ENV.propositions))
+    for s, e in np.ndindex(T, E):
+        held = pairs(t.outcome.labels[s, e])
+        expected = [
+            1.0 if p in held else CONFIG.shield.discount * float(t.reach_value[s, e, p])
+            for p in range(len(ENV.propositions))
+        ]
+        np.testing.assert_allclose(batch.target[e, s], expected, rtol=1e-5, atol=1e-6)
+        assert batch.action[e, s] == t.low.action[s, e]
+        jax.tree.map(lambda x, y, s=s, e=e: np.testing.assert_array_equal(x[e, s], y[s, e]), batch.view, t.view)
+    assert t.outcome.terminated.any()
 
 
 def states(t: Step, node: np.ndarray, blocked: np.ndarray) -> TaskState:
