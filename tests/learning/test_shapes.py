@@ -43,8 +43,9 @@ def test_an_iteration_of_every_preset_recipe_and_method_has_its_shapes(name: str
     assert {metric.shape for metric in metrics.values()} == {()}
 
 
-def _kind(x: jax.ShapeDtypeStruct) -> tuple[Any, Any]:
-    return x.shape, x.dtype
+def _kind(x: jax.ShapeDtypeStruct) -> tuple[Any, Any, bool]:
+    """All that a compiled program depends on: were the weak type another one, the second iteration would compile."""
+    return x.shape, x.dtype, x.weak_type
 
 
 def _blank(config: CurriculumConfig, num_propositions: int) -> TaskTree:
