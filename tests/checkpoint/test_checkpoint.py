@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 from flax import struct
 
-from hrlspec import checkpoint
 from hrlspec.checkpoint import (
     CheckpointDamagedError,
     CheckpointMismatchError,
