@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
 from envs_jax import Letter, Walk
 from envs_jax.rooms.world import Rooms
+from hrlspec.agent.agent import Agent
 from hrlspec.evaluation import Suite, suite_from_text
 from hrlspec.presets import RECIPES, preset_for
 from hrlspec.presets.generic import unseen_tasks
@@ -46,6 +48,17 @@ def test_settings_by_spaces(env: Any, recipe: Any) -> None:
     small_steps = isinstance(env, Walk)
     assert (config.noise_correlation > 0) == small_steps
     assert (config.num_steps > 64) == small_steps
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize("env", [Letter(), Letter(size=3, num_letters=2, num_cells=2), Rooms(), Corridor(), Walk()])
+def test_networks_fit_what_is_seen(env: Any, recipe: Any) -> None:
+    """Images of any size; a convolution of 2x2 takes a row and a column."""
+    config, method = preset_for(env).settings("ours", recipe)
+    params = jax.eval_shape(Agent(env, config, method).init, jax.random.key(0))
+    assert all(leaf.size for leaf in jax.tree.leaves(params))
+    if recipe == "paper" and len(env.observation_shape) == 3:
+        assert len(config.network.conv_channels) == min(3, min(env.observation_shape[1:]) - 1)
 
 
 @pytest.mark.parametrize("number", [1, 2, 3, 4])
