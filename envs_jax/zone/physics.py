@@ -115,7 +115,7 @@ def check_backend(backend: str, *, walls: bool) -> None:
         raise ValueError('physics="closed-form" knows no solid walls; use physics="mjx"')
 
 
-def step_function(backend: Backend, *, walls: bool = False, scalarized: bool = True) -> Step:
+def step_function(backend: str, *, walls: bool = False, scalarized: bool = True) -> Step:
     """One environment step, ``(body [6], control [2]) -> (body [6], sensors [12])``, in the body's dtype.
 
     Args:

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Bool, Float, Float32, Int32, Key, Shaped
+from jaxtyping import Bool, Float, Int32, Key, Shaped
 
 from envs_jax.arrays import Array
 from envs_jax.base import Box, ContestedChoice, Drawable, EnvParams, Reflections, StepResult, Symmetric
@@ -214,7 +214,7 @@ class Zone(Symmetric, ContestedChoice, Drawable):
 
     def reset_to(
         self, layout: ZoneLayout, key: Key[Array, ""], params: EnvParams
-    ) -> tuple[Float32[Array, "..."], ZoneState]:
+    ) -> tuple[Float[Array, "..."], ZoneState]:
         """Starts at rest in a given layout."""
         del key
         layout = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), layout)
@@ -252,7 +252,7 @@ class Zone(Symmetric, ContestedChoice, Drawable):
         del params
         return self._touched(state.body, state.layout.zones) & ~state.vanished
 
-    def observation(self, state: ZoneState, params: EnvParams) -> Float32[Array, "..."]:
+    def observation(self, state: ZoneState, params: EnvParams) -> Float[Array, "..."]:
         """Sensors, lidar and, without solid walls, the wall sensor: float ``[80]`` or ``[76]``."""
         del params
         lidar = jnp.where(state.vanished[:, None], 0.0, lidar_readings(state.body, state.layout.zones, self.gain))
@@ -262,9 +262,7 @@ class Zone(Symmetric, ContestedChoice, Drawable):
             parts.append(jnp.exp(-jnp.abs(state.body[np.array([0, 1, 0, 1])] - sides)))
         return jnp.concatenate(parts)
 
-    def proposition_view(
-        self, observation: Float32[Array, "..."]
-    ) -> tuple[Float32[Array, "P ..."], Float32[Array, " F0"]]:
+    def proposition_view(self, observation: Float[Array, "..."]) -> tuple[Float[Array, "P ..."], Float[Array, " F0"]]:
         """Each colour's lidar, float ``[P, L]``, and the other readings scaled to about one, ``[16]`` or ``[12]``."""
         end = NUM_SENSORS + len(COLOURS) * LIDAR_BINS
         lidar = observation[NUM_SENSORS:end].reshape(len(COLOURS), LIDAR_BINS)
@@ -301,7 +299,7 @@ class Zone(Symmetric, ContestedChoice, Drawable):
         return vanished
 
 
-def lidar_readings(body: Float[Array, " 6"], zones: Float[Array, "P Z 2"], gain: float) -> Float[Array, "..."]:
+def lidar_readings(body: Float[Array, " _"], zones: Float[Array, "P Z 2"], gain: float) -> Float[Array, "..."]:
     """What the lidar of each colour sees, float ``[P, L]``.
 
     A zone at distance d fills the bin its bearing lies in with ``exp(-gain · d)``, the next one with the share of the

@@ -6,6 +6,7 @@ import functools
 
 from envs_jax import Walk
 from envs_jax.rooms.world import Rooms
+from hrlspec.presets.letter import LETTER
 from hrlspec.presets.preset import Preset
 from hrlspec.presets.recipes import Recipe, Settings
 from hrlspec.presets.walk import WALK, walk, walk_with_bonuses
@@ -44,7 +45,7 @@ def _small(settings: Settings) -> Settings:
     )
 
 
-ROOMS = Preset("rooms", Rooms, _rooms, quick_compile=True)
+ROOMS = Preset("rooms", Rooms, _rooms, learning_rates=LETTER.learning_rates, quick_compile=True)
 DILEMMA = Preset(
     "dilemma",
     # The way to b leads past a, and reaching a ends the task before c, which pays most, can be reached.

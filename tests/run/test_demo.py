@@ -50,16 +50,21 @@ def test_bad_input(flags: str, message: str) -> None:
 
 @pytest.mark.slow
 def test_thinking_ahead_fetches_the_key_first() -> None:
-    """Ours within 5 % of the optimum; Option no better than coming back for the key."""
+    """Ours within 5 % of the optimum; Option, where it succeeds, no better than coming back for the key.
+
+    Over three seeds Option's greedy policy succeeded in 0.70 to 1.00 of the episodes, and went in circles in the rest.
+    """
     rooms = demo.DEMOS["rooms"]
     steps = {}
     for method in rooms.methods:
         shown = demo.act(rooms, demo.train(rooms, method, rooms.steps, 0), 0)
-        assert shown.episodes.success.mean() > 0.99
-        steps[method] = shown.episodes.steps.mean()
+        success = shown.episodes.success
+        assert success.mean() > (0.99 if method == "ours" else 0.3)
+        steps[method] = shown.episodes.steps[success].mean()
     each = [jax.tree.map(lambda x, i=i: x[i], shown.layouts) for i in range(demo.LAYOUTS)]
     assert steps["ours"] < 1.05 * np.mean([fewest_steps(x, key_first=True) for x in each])
-    assert steps["option"] > 0.95 * np.mean([fewest_steps(x, key_first=False) for x in each])
+    # Of the layouts that the last method succeeded in.
+    assert steps["option"] > 0.95 * np.mean([fewest_steps(each[i], key_first=False) for i in np.flatnonzero(success)])
 
 
 @pytest.mark.slow
