@@ -299,7 +299,9 @@ class Zone(Symmetric, ContestedChoice, Drawable):
         return vanished
 
 
-def lidar_readings(body: Float[Array, " _"], zones: Float[Array, "P Z 2"], gain: float) -> Float[Array, "..."]:
+def lidar_readings(
+    body: Float[Array, " _"], zones: Float[Array, "P Z 2"], gain: float | Float[Array, ""]
+) -> Float[Array, "..."]:
     """What the lidar of each colour sees, float ``[P, L]``.
 
     A zone at distance d fills the bin its bearing lies in with ``exp(-gain · d)``, the next one with the share of the
