@@ -68,11 +68,11 @@ def suite_texts(world: str, rules: Mapping[str, SuiteRule], propositions: Sequen
         seed, where = seed_of_suite(world, name), f"{world}/{name}"
         trees = draw_suite(np.random.default_rng(seed), rule, len(propositions), taken, where)
         taken = np.concatenate([taken, task_hashes(trees)])
-        samplers = "sequences" if "sequences" in rule.about else "trees"
+        sampler = f"hrlspec.tasks.sampling.sample_{'sequences' if 'sequences' in rule.about else 'trees'}"
         comments = (
             f"{where}: {NUM_TASKS} unseen tasks",
             rule.about,
-            f"sampler hrlspec.spec.sample_{samplers}, seed {seed}, trees fit {MAX_NODES} nodes, no task twice",
+            f"sampler {sampler}, seed {seed}, trees fit {MAX_NODES} nodes, no task twice",
             "made by: python -m experiments.suites",
         )
         texts[name] = commented(comments, suite_from_trees(name, trees, propositions).formulas)
