@@ -32,7 +32,7 @@ class RunFlags(Checked):
     """
 
     env: str = _FIRST
-    """A name from above, or module:factory."""
+    """A name from above, or module:factory, or module:PRESET."""
     method: str = "ours"
     """A name from above, or module:VALUE."""
     recipe: Recipe = "hrlspec"

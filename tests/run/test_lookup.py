@@ -20,6 +20,7 @@ from typing import Any
 from envs_jax import Walk
 from envs_jax.rooms.world import Rooms
 from hrlspec.methods import OURS
+from hrlspec.presets import Preset
 
 VALUE = Walk(horizon=7)
 
@@ -44,6 +45,14 @@ class Odd(Rooms):
     propositions = ("blue", "red ball")
 
 METHOD = OURS.replace(transe=0.5)
+
+PRESET = Preset("mine", make, texts={"dag": "achieve a; achieve b"})
+
+MAKES_NOTHING = Preset("nothing", dict)
+
+FAILS = Preset("fails", broken)
+
+LISTS = Preset("lists", Unhashable)
 """
 
 
@@ -73,6 +82,12 @@ def test_a_value_a_class_and_a_function(name: str) -> None:
     assert dataclasses.asdict(method_named(f"{name}:METHOD"))["high"]["transe"] == 0.5
 
 
+def test_a_preset(name: str) -> None:
+    mine = preset_named(f"{name}:PRESET")
+    assert mine.make() == Walk(horizon=8)
+    assert (mine.name, mine.suite_names) == ("mine", ("dag",))
+
+
 @pytest.mark.parametrize(
     ("attribute", "message"),
     [
@@ -81,6 +96,9 @@ def test_a_value_a_class_and_a_function(name: str) -> None:
         ("broken", "cannot be used: RuntimeError: the file is gone"),
         ("METHOD", "is of type Ours, expected an environment"),
         ("Unhashable", "cannot be used: TypeError: unhashable type"),
+        ("MAKES_NOTHING", "makes a value of type dict, expected an environment"),
+        ("FAILS", "cannot be used: RuntimeError: the file is gone"),
+        ("LISTS", "cannot be used: TypeError: unhashable type"),
         ("Odd", "tasks cannot name the proposition 'red ball': line 1, column 13"),
     ],
 )
