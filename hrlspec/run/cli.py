@@ -70,3 +70,7 @@ def _command(name: str) -> Callable[..., None]:
             raise
         raise UserError('the commands need the extra "cli": pip install "hrlspec[cli]"') from error
     return command
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -29,6 +29,14 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == f"hrlspec {__version__}\n"
 
 
+def test_as_a_module(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "hrlspec.run.cli", "reproduce"]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert len(ended.stderr.splitlines()) == 1
+    assert "checkout" in ended.stderr
+
+
 @pytest.mark.parametrize("argv", [[], ["fly"], ["--fly"]])
 def test_anything_else_is_refused(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(argv) == 2
