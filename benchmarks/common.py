@@ -141,7 +141,7 @@ def training(name: str, recipe: Recipe, seconds: float) -> dict[str, Any]:
     @jax.jit
     def roll(collector: Any) -> Any:
         tasks = jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank)
-        book = agent.low.open_book(state.params, tasks)
+        book = agent.low.prepare(state.params, tasks)
         pool = fill_pool(jax.random.key(1), agent, book, state.curriculum.level, size=config.episode_slots)
         setting = Setting(agent, state.params, machine, book, pool)
         return collect(jax.random.key(2), setting, collector, config.noise_correlation)[0]

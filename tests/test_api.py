@@ -163,10 +163,10 @@ def test_what_cannot_be_meant_is_refused(wrong: dict[str, Any], error: type[Exce
 class ObedientLow(LowLevel):
     """Walks straight to what its sub-task reaches, whatever it avoids."""
 
-    def control(self, params: Any, view: Any, told: Any) -> tuple[jax.Array, jax.Array]:
+    def control(self, params: Any, view: Any, instruction: Any) -> tuple[jax.Array, jax.Array]:
         planes, here = view
         cells = jnp.arange(here.shape[0])
-        right = (told.reach @ planes @ cells) > here @ cells
+        right = (instruction.reach @ planes @ cells) > here @ cells
         return jnp.where(right, 10.0, -10.0) * jnp.array([-1.0, 1.0]), jnp.float32(0)
 
 

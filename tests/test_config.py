@@ -98,7 +98,7 @@ BOUNDS: dict[type, dict[str, tuple[float, float]]] = {
         "transe_margin": (0, 1e6),
         "advised": (1, INF),
     },
-    LogicValueIteration: {"sharpness": (0, 1e6), "fading": (0, 1)},
+    LogicValueIteration: {"sharpness": (0, 1e6), "decay": (0, 1)},
 }
 """The least and the most that each number, or each entry of a tuple, may be; both included."""
 
@@ -166,7 +166,7 @@ def test_bounds_are_included_and_nothing_beyond_them_is(kind: type, name: str) -
             lambda: Config(num_envs=12, low=PPOConfig(optimiser=ONE)),
             "Config.shield.optimiser.minibatches is 8, expected a divisor of 12, the number of environments",
         ),
-        (lambda: LogicValueIteration(fading=-0.1), "LogicValueIteration.fading is -0.1, expected a number from 0 to 1"),
+        (lambda: LogicValueIteration(decay=-0.1), "LogicValueIteration.decay is -0.1, expected a number from 0 to 1"),
     ],
 )
 def test_one_line_says_what_is_wrong(wrong: Any, message: str) -> None:

@@ -59,7 +59,7 @@ class Run:
     def flags(self) -> list[str]:
         """The flags of ``experiments.run`` that make it, without those that say where."""
         curve = self.curve
-        told = {
+        flags = {
             "env": self.env,
             "method": curve.method,
             "recipe": curve.recipe,
@@ -68,7 +68,7 @@ class Run:
             "total-steps": self.total_steps,
             "evaluation.every": max(1, self.total_steps // POINTS),
         }
-        return [part for name, value in told.items() for part in (f"--{name}", str(value))] + list(curve.switches)
+        return [part for name, value in flags.items() for part in (f"--{name}", str(value))] + list(curve.switches)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -95,7 +95,7 @@ class HighLevel(abc.ABC):
 
     @abc.abstractmethod
     def choose(
-        self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
+        self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, instructions: Instruction
     ) -> Choice:
         """Evaluates the open edges in B environments.
 
@@ -105,7 +105,7 @@ class HighLevel(abc.ABC):
             view: what is seen.
             tree: the tasks.
             state: where they stand.
-            told: the instruction for each edge, leading axes ``[B, N]``.
+            instructions: the instruction for each edge, leading axes ``[B, N]``.
         """
 
     def judge(
@@ -115,11 +115,11 @@ class HighLevel(abc.ABC):
         view: View,
         tree: TaskTree,
         state: TaskState,
-        told: Instruction,
+        instructions: Instruction,
         edge: Int32[Array, " B"],
     ) -> Judgement:
         """What it thinks of choosing ``edge`` (int32 ``[B]``), which relabelling made the task's own path."""
-        choice = self.choose(low, params, view, tree, state, told)
+        choice = self.choose(low, params, view, tree, state, instructions)
         log_prob = jax.vmap(Categorical(choice.logits.shape[-1]).log_prob)(choice.logits, edge)
         return Judgement(log_prob, choice.value, choice.advice)
 

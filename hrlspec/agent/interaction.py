@@ -74,7 +74,7 @@ def start(
         view=_views(env, observation),
         task=tasks,
         task_state=jax.vmap(initial)(task_of(book, tasks)),
-        decision=undecided(num_envs, book.tree.num_nodes, book.told.ahead.shape[2:]),
+        decision=undecided(num_envs, book.tree.num_nodes, book.instructions.ahead.shape[2:]),
         awaiting=jnp.ones(num_envs, bool),
         rules=jnp.broadcast_to(rewards.initial(machine), (num_envs, machine.num_rules)),
     )
@@ -101,8 +101,8 @@ def decide(
 
     def choose(inputs: tuple[View, Int[Array, " B"], TaskState, Float32[Array, "B N"]]) -> HighDecision:
         view, task, state, noise = inputs
-        tree, told = jax.tree.map(lambda x: x[task], (book.tree, book.told))
-        choice = agent.high.choose(agent.low, params, view, tree, state, told)
+        tree, instructions = jax.tree.map(lambda x: x[task], (book.tree, book.instructions))
+        choice = agent.high.choose(agent.low, params, view, tree, state, instructions)
         edge, log_prob = jax.vmap(Categorical(noise.shape[-1]).sample)(choice.logits, noise)
         ahead = choice.ahead[jnp.arange(edge.shape[0]), edge]
         return HighDecision(jnp.ones(edge.shape, bool), edge, ahead, log_prob, choice.value, choice.advice)
@@ -126,16 +126,18 @@ def act(
     """Chooses actions for the sub-tasks in force, leading axis E."""
     low = agent.low
 
-    def one(view: View, told: Instruction, noise: Float32[Array, "*_"]) -> LowDecision:
-        outputs, value = low.control(params, view, told)
+    def one(view: View, instruction: Instruction, noise: Float32[Array, "*_"]) -> LowDecision:
+        outputs, value = low.control(params, view, instruction)
         action, log_prob = low.actions.sample(outputs, noise)
-        safe = shielded_action(low, params, view, told.avoid > 0, action) if shield else action
+        safe = shielded_action(low, params, view, instruction.avoid > 0, action) if shield else action
         return LowDecision(action=safe, log_prob=log_prob, value=value, shielded=(safe != action).any())
 
     feasible = jax.vmap(open_edges)(task_of(book, worker.task), worker.task_state)
     decision = worker.decision
-    told = low.told_now(params, book.told, (worker.task,), decision.edge, feasible, decision.ahead)
-    return jax.vmap(one)(worker.view, told, noise)
+    instructions = low.instructions_at(
+        params, book.instructions, (worker.task,), decision.edge, feasible, decision.ahead
+    )
+    return jax.vmap(one)(worker.view, instructions, noise)
 
 
 def transition(

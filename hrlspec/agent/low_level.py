@@ -34,11 +34,11 @@ class TaskBook:
 
     Attributes:
         tree: the tasks, leading axis M.
-        told: the instruction for each edge, leading axes ``[M, N]``.
+        instructions: the instruction for each edge, leading axes ``[M, N]``.
     """
 
     tree: TaskTree
-    told: Instruction
+    instructions: Instruction
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,14 +82,14 @@ class LowLevel:
         """The instruction for every edge of one task, leading axis N."""
         return cast(Instruction, self.controller.apply(params["low"], tree, method="instruct"))
 
-    def open_book(self, params: Params, trees: TaskTree) -> TaskBook:
+    def prepare(self, params: Params, trees: TaskTree) -> TaskBook:
         """Prepares tasks (leading axis M) for acting."""
-        return TaskBook(tree=trees, told=jax.vmap(self.instruct, in_axes=(None, 0))(params, trees))
+        return TaskBook(tree=trees, instructions=jax.vmap(self.instruct, in_axes=(None, 0))(params, trees))
 
-    def told_now(
+    def instructions_at(
         self,
         params: Params,
-        told: Instruction,
+        instructions: Instruction,
         where: tuple[Int[Array, "..."], ...],
         edge: Int32[Array, "*lead"],
         feasible: Bool[Array, "*lead _"],
@@ -99,39 +99,44 @@ class LowLevel:
 
         Args:
             params: the networks' parameters.
-            told: the instructions for every edge, as in a `TaskBook`: any leading axes, then N.
+            instructions: the instructions for every edge, as in a `TaskBook`: any leading axes, then N.
             where: indices of the tasks, one for each leading axis.
             edge: int32 ``[...]``, the edges assigned.
             feasible: bool ``[..., N]``, the open edges; used where the policy is conditioned on the whole task.
             ahead: float32 ``[..., D, P]``, the reach sets of the sub-tasks planned after them.
         """
         if self.sees != "whole task":
-            return dataclasses.replace(jax.tree.map(lambda x: x[(*where, edge)], told), ahead=ahead)
-        future = self.controller.apply(params["low"], told.future[where], feasible, method="remaining")
-        nothing = jnp.zeros((*edge.shape, told.reach.shape[-1]))
-        behind = jnp.zeros((*edge.shape, 0, told.reach.shape[-1]))
+            return dataclasses.replace(jax.tree.map(lambda x: x[(*where, edge)], instructions), ahead=ahead)
+        future = self.controller.apply(params["low"], instructions.future[where], feasible, method="remaining")
+        nothing = jnp.zeros((*edge.shape, instructions.reach.shape[-1]))
+        behind = jnp.zeros((*edge.shape, 0, instructions.reach.shape[-1]))
         return Instruction(reach=nothing, avoid=nothing, ahead=ahead, behind=behind, future=cast(Array, future))
 
     def control(
-        self, params: Params, view: View, told: Instruction
+        self, params: Params, view: View, instruction: Instruction
     ) -> tuple[Float32[Array, " outputs"], Float32[Array, ""]]:
         """What describes the policy on one environment (see ``actions``), and the value ``[]``."""
-        return cast("tuple[Array, Array]", self.controller.apply(params["low"], view, told))
+        return cast("tuple[Array, Array]", self.controller.apply(params["low"], view, instruction))
 
     def value_of(
-        self, params: Params, view: View, told: Instruction, edge: Int[Array, " B"], feasible: Bool[Array, "B N"]
+        self,
+        params: Params,
+        view: View,
+        instructions: Instruction,
+        edge: Int[Array, " B"],
+        feasible: Bool[Array, "B N"],
     ) -> Float32[Array, " B"]:
         """V^l of pursuing an edge in each of B environments, ``[B]``.
 
         Args:
             params: the networks' parameters.
             view: observations.
-            told: the instruction for each edge, leading axes ``[B, N]``.
+            instructions: the instruction for each edge, leading axes ``[B, N]``.
             edge: int32 ``[B]``.
             feasible: bool ``[B, N]``, the open edges.
         """
         rows = jnp.arange(edge.shape[0])
-        now = self.told_now(params, told, (rows,), edge, feasible, told.ahead[rows, edge])
+        now = self.instructions_at(params, instructions, (rows,), edge, feasible, instructions.ahead[rows, edge])
         return jax.vmap(self.control, in_axes=(None, 0, 0))(params, view, now)[1]
 
     def reach_values(self, params: Params, view: View) -> Float32[Array, "P K"]:

@@ -129,7 +129,7 @@ def _run(
 ) -> tuple[Episodes, Trace | None]:
     num_episodes, num_nodes = trees.parent.shape
     rows = jnp.arange(num_episodes, dtype=jnp.int32)
-    env, book = agent.env, agent.low.open_book(params, trees)
+    env, book = agent.env, agent.low.prepare(params, trees)
     worker = start(jax.vmap(jax.random.fold_in, (None, 0))(key, rows), env, machine, book, layouts, rows)
     noise_scale = 0.0 if greedy else 1.0
     zeros = jnp.zeros(num_episodes)

@@ -99,7 +99,7 @@ def copies(
     record = _record(agent, book, rollout)
     new = _relabelled(keys, agent, machine, record, reserved)
     slot = jnp.minimum(rollout.episode, new.tree.parent.shape[1] - 1)
-    high, low = _opinions(agent, params, rollout, new, slot)
+    high, low = _estimates(agent, params, rollout, new, slot)
     shape, nothing = slot.shape, jnp.zeros_like(new.reward)
     blocked = jnp.zeros((*shape, new.tree.num_nodes), bool)
     return Experience(
@@ -127,15 +127,15 @@ def copies(
     )
 
 
-def _opinions(
+def _estimates(
     agent: Agent, params: Params, rollout: Step, new: Relabelled, slot: Int32[Array, "E T"]
 ) -> tuple[HighDecision, LowDecision]:
     """Both levels' log-probabilities and values of the recorded decisions under the new tasks."""
     row = (jnp.arange(slot.shape[0])[:, None] * new.tree.parent.shape[1] + slot).reshape(-1)
-    fresh = agent.low.open_book(params, jax.tree.map(_flat, new.tree))
+    fresh = agent.low.prepare(params, jax.tree.map(_flat, new.tree))
     view, edge, node = jax.tree.map(_flat, (rollout.view, new.assigned, new.node))
-    told = _told(agent, params, fresh, row, edge, node, new)
-    outputs, value = jax.vmap(agent.low.control, in_axes=(None, 0, 0))(params, view, told)
+    instructions = _instructions(agent, params, fresh, row, edge, node, new)
+    outputs, value = jax.vmap(agent.low.control, in_axes=(None, 0, 0))(params, view, instructions)
     log_prob = jax.vmap(agent.low.actions.log_prob)(outputs, _flat(rollout.low.action))
     judgement = _judged(agent, params, fresh, view, row, node, edge, _flat(new.decided))
 
@@ -146,7 +146,7 @@ def _opinions(
     high = HighDecision(
         made=new.decided,
         edge=new.assigned,
-        ahead=shaped(told.ahead),
+        ahead=shaped(instructions.ahead),
         # The path was no choice: its probability counts relative to 1.
         log_prob=jnp.zeros_like(new.reward) if corrected else shaped(judgement.log_prob),
         value=shaped(judgement.value),
@@ -196,7 +196,7 @@ def _relabelled(
     return jax.vmap(one)(keys, record)
 
 
-def _told(
+def _instructions(
     agent: Agent,
     params: Params,
     fresh: TaskBook,
@@ -208,14 +208,16 @@ def _told(
     """The low level's instructions under the new tasks, leading axis R."""
     tree = fresh.tree
     feasible = tree.valid[row] & (tree.parent[row] == node[:, None])
-    told = agent.low.told_now(params, fresh.told, (row,), edge, feasible, fresh.told.ahead[row, edge])
+    instructions = agent.low.instructions_at(
+        params, fresh.instructions, (row,), edge, feasible, fresh.instructions.ahead[row, edge]
+    )
     if agent.high.follows_plan and agent.method.sees == "future":
         # The plan of a relabelled task is the path that was completed; its nodes follow one another.
-        later = edge[:, None] + 1 + jnp.arange(told.ahead.shape[1])
+        later = edge[:, None] + 1 + jnp.arange(instructions.ahead.shape[1])
         on_path = later <= new.path_length.reshape(-1)[row][:, None]
         ahead = tree.reach[row[:, None], jnp.minimum(later, tree.num_nodes - 1)] & on_path[..., None]
-        told = dataclasses.replace(told, ahead=ahead.astype(jnp.float32))
-    return told
+        instructions = dataclasses.replace(instructions, ahead=ahead.astype(jnp.float32))
+    return instructions
 
 
 def _judged(
@@ -232,9 +234,9 @@ def _judged(
 
     def judge(inputs: tuple[View, Array, Array, Array]) -> Judgement:
         view, row, node, edge = inputs
-        tree, told = jax.tree.map(lambda x: x[row], (fresh.tree, fresh.told))
+        tree, instructions = jax.tree.map(lambda x: x[row], (fresh.tree, fresh.instructions))
         state = dataclasses.replace(jax.vmap(initial)(tree), node=node)
-        return agent.high.judge(agent.low, params, view, tree, state, told, edge)
+        return agent.high.judge(agent.low, params, view, tree, state, instructions, edge)
 
     nothing = jnp.zeros(decided.shape)
     unknown = Judgement(nothing, nothing, jnp.zeros((*decided.shape, fresh.tree.num_nodes)))

@@ -108,7 +108,7 @@ class Trainer:
         chex.assert_type(reserved, jnp.uint32)
         progress = state.iteration / config.num_iterations
         keys = jax.random.split(jax.random.fold_in(state.key, state.iteration), 5)
-        book = agent.low.open_book(state.params, jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank))
+        book = agent.low.prepare(state.params, jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank))
         collector = dataclasses.replace(
             state.collector,
             worker=dataclasses.replace(state.collector.worker, task=jnp.arange(config.num_envs, dtype=jnp.int32)),
@@ -149,7 +149,7 @@ class Trainer:
             return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, envs)
 
         layouts = jax.vmap(env.sample_layout, in_axes=(0, None))(each(layout_key), env.default_params)
-        worker = start(each(reset_key), env, machine, agent.low.open_book(params, tasks), layouts, envs)
+        worker = start(each(reset_key), env, machine, agent.low.prepare(params, tasks), layouts, envs)
         elapsed = jax.random.randint(stagger_key, envs.shape, 0, env.horizon)
         worker = dataclasses.replace(
             worker,

@@ -33,14 +33,14 @@ class NoChoice(Checked, HighLevel):
         return {}
 
     def choose(
-        self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
+        self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, instructions: Instruction
     ) -> Choice:
         """The root, which is no edge."""
         feasible = jax.vmap(open_edges)(tree, state)
         root = jnp.arange(tree.num_nodes) == TaskTree.ROOT
         logits = jnp.where(root, jnp.zeros(feasible.shape), MASKED)
-        value = low.value_of(params, view, told, logits.argmax(-1), feasible)
-        return Choice(logits, value, jnp.zeros(logits.shape), told.ahead)
+        value = low.value_of(params, view, instructions, logits.argmax(-1), feasible)
+        return Choice(logits, value, jnp.zeros(logits.shape), instructions.ahead)
 
 
 @dataclasses.dataclass(frozen=True)

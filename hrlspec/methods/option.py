@@ -67,7 +67,7 @@ def measure(
     reward: Float32[Array, "T E"],
     *,
     discount: float,
-    fading: float,
+    decay: float,
 ) -> Measurements:
     """Adds the attempts that ended in a rollout; leading axes of all arrays ``[T, E]``.
 
@@ -81,7 +81,7 @@ def measure(
         duration: int32, steps since the sub-task was assigned, this one included.
         reward: float32, of this step.
         discount: γ.
-        fading: decay of the weight of earlier measurements.
+        decay: factor on the weight of earlier measurements, per iteration.
     """
     origin, goal = origin.astype(jnp.float32), goal.astype(jnp.float32)
     success = ended & reached
@@ -94,10 +94,10 @@ def measure(
         return jnp.einsum("kte,teg->kg", weight, goal)
 
     return Measurements(
-        attempts=fading * known.attempts + pairs(ended.astype(jnp.float32)),
-        discounted=fading * known.discounted + pairs(success * discount ** duration.astype(jnp.float32)),
-        successes=fading * known.successes + goals(kinds),
-        rewards=fading * known.rewards + goals(kinds * reward),
+        attempts=decay * known.attempts + pairs(ended.astype(jnp.float32)),
+        discounted=decay * known.discounted + pairs(success * discount ** duration.astype(jnp.float32)),
+        successes=decay * known.successes + goals(kinds),
+        rewards=decay * known.rewards + goals(kinds * reward),
     )
 
 
@@ -138,7 +138,7 @@ class LogicValueIteration(Checked, HighLevel):
 
     sharpness: float = setting(100.0, least=0, most=1e6)
     """Logits per unit of value, the inverse temperature of the choice among options."""
-    fading: float = setting(0.98, least=0, most=1)
+    decay: float = setting(0.98, least=0, most=1)
     """Decay of a measurement's weight per iteration: options change while they are learned."""
 
     def init(self, key: Key[Array, ""], low: LowLevel, view: View, tree: TaskTree) -> Measurements:
@@ -147,15 +147,15 @@ class LogicValueIteration(Checked, HighLevel):
         return unmeasured(tree.num_propositions)
 
     def choose(
-        self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
+        self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, instructions: Instruction
     ) -> Choice:
         """See :class:`HighLevel`; V^h is the low level's value of the best option."""
         feasible = jax.vmap(open_edges)(tree, state)
         value = jax.vmap(values, in_axes=(None, 0, 0))(params["high"], tree, state)
         best = jnp.where(feasible.any(-1), value.max(-1), 0.0)
         logits = jnp.where(feasible, self.sharpness * (value - best[:, None]), MASKED)
-        value = low.value_of(params, view, told, logits.argmax(-1), feasible)
-        return Choice(logits, value, jnp.zeros(logits.shape), told.ahead)
+        value = low.value_of(params, view, instructions, logits.argmax(-1), feasible)
+        return Choice(logits, value, jnp.zeros(logits.shape), instructions.ahead)
 
     def low_level_rewards(self, experience: Experience) -> Rewards:
         """Each option is over when its sub-task is, and earns 1 if it reached its goal, whatever the task pays."""
@@ -179,7 +179,7 @@ class LogicValueIteration(Checked, HighLevel):
             steps.since + 1,
             outcome.reward,
             discount=config.discount,
-            fading=self.fading,
+            decay=self.decay,
         )
 
 

@@ -80,10 +80,10 @@ class ImplicitPlanner(Checked, HighLevel):
         return self.planner(low).init(key, view, tree, state, jnp.zeros(tree.num_nodes))
 
     def choose(
-        self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
+        self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, instructions: Instruction
     ) -> Choice:
         """See :class:`HighLevel`."""
-        advice, ahead = self.advise(low, params, view, tree, state, told)
+        advice, ahead = self.advise(low, params, view, tree, state, instructions)
         plan = jax.vmap(self.planner(low).apply, in_axes=(None, 0, 0, 0, 0))
         logits, value = cast("tuple[Array, Array]", plan(params["high"], view, tree, state, advice))
         return Choice(logits, value, advice, ahead)
@@ -95,7 +95,7 @@ class ImplicitPlanner(Checked, HighLevel):
         view: View,
         tree: TaskTree,
         state: TaskState,
-        told: Instruction,
+        instructions: Instruction,
         edge: Int32[Array, " B"],
     ) -> Judgement:
         """See :class:`HighLevel`.
@@ -103,12 +103,12 @@ class ImplicitPlanner(Checked, HighLevel):
         A copy ends in success and its returns are known: the planner is evaluated only where its outputs are used.
         """
         if self.learns_from_copies or self.max_operator:
-            return super().judge(low, params, view, tree, state, told, edge)
+            return super().judge(low, params, view, tree, state, instructions, edge)
         nothing = jnp.zeros(edge.shape)
-        return Judgement(nothing, nothing, self.advise(low, params, view, tree, state, told)[0])
+        return Judgement(nothing, nothing, self.advise(low, params, view, tree, state, instructions)[0])
 
     def advise(
-        self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
+        self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, instructions: Instruction
     ) -> tuple[Float32[Array, "B N"], Float32[Array, "B N D P"]]:
         """The low level's advice in B environments: its value of each feasible edge and the best path on to a leaf.
 
@@ -122,8 +122,8 @@ class ImplicitPlanner(Checked, HighLevel):
             ``[B, N, D, P]``.
         """
         if not self.network.advice:
-            return jnp.zeros(tree.parent.shape), told.ahead
-        edge, known, paths = jax.vmap(self._paths, in_axes=(None, 0, 0, 0))(low, tree, state, told)
+            return jnp.zeros(tree.parent.shape), instructions.ahead
+        edge, known, paths = jax.vmap(self._paths, in_axes=(None, 0, 0, 0))(low, tree, state, instructions)
         num_paths = known.shape[1]
 
         def value(inputs: tuple[Int32[Array, " G"], Instruction]) -> Float32[Array, " G"]:
@@ -135,7 +135,7 @@ class ImplicitPlanner(Checked, HighLevel):
         flat_paths = jax.tree.map(lambda x: x.reshape((known.size, *x.shape[2:])), paths)
         group = 2 * low.config.group
         values = in_groups(value, known.reshape(-1), (env, flat_paths), jnp.zeros(env.shape), group)
-        advice, ahead = jax.vmap(_best_paths)(edge, known, values.reshape(known.shape), paths.ahead, told.ahead)
+        advice, ahead = jax.vmap(_best_paths)(edge, known, values.reshape(known.shape), paths.ahead, instructions.ahead)
         return jax.lax.stop_gradient(advice), ahead
 
     def loss(
@@ -183,17 +183,17 @@ class ImplicitPlanner(Checked, HighLevel):
         return ppo.masked_mean(error, valid & batch.completed) + ppo.masked_mean(margin, both)
 
     def _paths(
-        self, low: LowLevel, tree: TaskTree, state: TaskState, told: Instruction
+        self, low: LowLevel, tree: TaskTree, state: TaskState, instructions: Instruction
     ) -> tuple[Int32[Array, " L"], Bool[Array, " L"], Instruction]:
         """The paths open in one environment: first edges ``[L]``, which of them exist ``[L]``, and instructions."""
         num_nodes = tree.num_nodes
-        path = routes(tree, state.node, 1 + told.ahead.shape[1])
+        path = routes(tree, state.node, 1 + instructions.ahead.shape[1])
         leads = tree.accepting & (path[:, 0] >= 0) & open_edges(tree, state)[path[:, 0]]
         leaf = jnp.nonzero(leads, size=min(self.advised, num_nodes), fill_value=num_nodes)[0]
         path = path[jnp.minimum(leaf, num_nodes - 1)]
         edge, later = path[:, 0], path[:, 1:]
         ahead = tree.reach[later] & (later >= 0)[..., None] & (low.sees == "future")
-        some = dataclasses.replace(jax.tree.map(lambda x: x[edge], told), ahead=ahead.astype(jnp.float32))
+        some = dataclasses.replace(jax.tree.map(lambda x: x[edge], instructions), ahead=ahead.astype(jnp.float32))
         return edge, leaf < num_nodes, some
 
 
@@ -202,14 +202,14 @@ def _best_paths(
     known: Bool[Array, " L"],
     values: Float32[Array, " L"],
     path_ahead: Float32[Array, "L D P"],
-    told_ahead: Float32[Array, "N D P"],
+    default_ahead: Float32[Array, "N D P"],
 ) -> tuple[Float32[Array, " N"], Float32[Array, "N D P"]]:
     """From values of paths ``[L]`` to each edge's best value ``[N]`` and what lies ahead on its best path."""
-    mine = (edge == jnp.arange(told_ahead.shape[0])[:, None]) & known
+    mine = (edge == jnp.arange(default_ahead.shape[0])[:, None]) & known
     score = jnp.where(mine, values, -jnp.inf)
     worst = jnp.where(known.any(), jnp.where(known, values, jnp.inf).min(), 0.0)
     advice = jnp.where(mine.any(1), score.max(1), worst)
-    return advice, jnp.where(mine.any(1)[:, None, None], path_ahead[score.argmax(1)], told_ahead)
+    return advice, jnp.where(mine.any(1)[:, None, None], path_ahead[score.argmax(1)], default_ahead)
 
 
 def _distance(x: Float32[Array, "B latent"], y: Float32[Array, "B latent"]) -> Float32[Array, " B"]:

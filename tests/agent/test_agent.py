@@ -91,28 +91,28 @@ def trees() -> TaskTree:
 
 def test_the_book_holds_each_sub_tasks_avoid_set(agent: Agent, trees: TaskTree) -> None:
     params = random_params(agent, 0)
-    book = quick_jit(agent.low.open_book)(params, trees)
+    book = quick_jit(agent.low.prepare)(params, trees)
     instruct = quick_jit(agent.low.instruct)
     for m in range(20):
         tree = jax.tree.map(lambda x, m=m: x[m], trees)
         alone = instruct(params, tree)
-        jax.tree.map(lambda x, y, m=m: np.testing.assert_allclose(x[m], y, atol=1e-5), book.told, alone)
-        np.testing.assert_array_equal(book.told.reach[m], tree.reach)
+        jax.tree.map(lambda x, y, m=m: np.testing.assert_allclose(x[m], y, atol=1e-5), book.instructions, alone)
+        np.testing.assert_array_equal(book.instructions.reach[m], tree.reach)
         for k in range(6):
             siblings = [j for j in range(6) if tree.valid[j] and tree.parent[j] == tree.parent[k] >= 0 and j != k]
             reached = set().union(*(pairs(tree.reach[j]) for j in siblings))
             expected = pairs(tree.avoid[k]) | (reached - pairs(tree.reach[k])) if tree.valid[k] else set()
-            assert pairs(book.told.avoid[m, k]) == expected
+            assert pairs(book.instructions.avoid[m, k]) == expected
 
 
 def test_myopic_low_sees_nothing_of_the_future(trees: TaskTree) -> None:
     agent, sighted = small_agent(Corridor(), method=MyopicLow(high=small_planner())), small_agent(Corridor())
     params = random_params(agent, 0)
-    for name, told in (
-        ("myopic", quick_jit(agent.low.open_book)(params, trees).told),
-        ("ours", sighted.low.open_book(params, trees).told),
+    for name, instruction in (
+        ("myopic", quick_jit(agent.low.prepare)(params, trees).instructions),
+        ("ours", sighted.low.prepare(params, trees).instructions),
     ):
-        assert np.asarray(told.reach).any()
-        assert np.asarray(told.avoid).any()
-        for future in (told.future, told.ahead):
+        assert np.asarray(instruction.reach).any()
+        assert np.asarray(instruction.avoid).any()
+        for future in (instruction.future, instruction.ahead):
             assert np.asarray(future).any() == (name == "ours")

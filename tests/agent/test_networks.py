@@ -230,21 +230,21 @@ def test_gradients_are_finite(rounds: int, extras: bool) -> None:
     accepting = jnp.argmax(trees.accepting, -1)
 
     def loss(params: Any) -> jax.Array:
-        book = agent.low.open_book(params, trees)
+        book = agent.low.prepare(params, trees)
         total = jnp.float32(0)
         for node in (jnp.zeros(4, jnp.int32), accepting):
             state = jax.vmap(initial)(trees).replace(node=node)
 
             views = jax.tree.map(lambda x: jnp.stack([x] * 4), VIEW)
-            choice = agent.high.choose(agent.low, params, views, trees, state, book.told)
+            choice = agent.high.choose(agent.low, params, views, trees, state, book.instructions)
             scores = jax.nn.log_softmax(choice.logits)
             total += jnp.where(jax.vmap(open_edges)(trees, state), scores, 0.0).sum() + choice.value.sum()
 
-            def one(told: Instruction) -> jax.Array:
-                actions, own = agent.low.control(params, VIEW, jax.tree.map(lambda x: x[1], told))
+            def one(instruction: Instruction) -> jax.Array:
+                actions, own = agent.low.control(params, VIEW, jax.tree.map(lambda x: x[1], instruction))
                 return jax.nn.log_softmax(actions)[0] + own
 
-            total += jax.vmap(one)(book.told).sum()
+            total += jax.vmap(one)(book.instructions).sum()
         return total + agent.low.reach_values(params, VIEW).sum()
 
     value, gradient = quick_jit(jax.value_and_grad(loss))(params)
@@ -320,11 +320,11 @@ def test_a_scaled_task_is_a_task_with_larger_weights(whole_task: bool) -> None:
         return x.at[rows].multiply(4.0) if first else x
 
     heads = ("actor", "critic")
-    told = instruction(np.eye(ENV.num_propositions, dtype=np.float32)[:2], network)
-    told = told.replace(future=np.linspace(-1, 1, network.task_features, dtype=np.float32))
+    assigned = instruction(np.eye(ENV.num_propositions, dtype=np.float32)[:2], network)
+    assigned = assigned.replace(future=np.linspace(-1, 1, network.task_features, dtype=np.float32))
     heard = {**params, "low": jax.tree_util.tree_map_with_path(louder, params["low"])}
-    before, after = plain.low.control(params, VIEW, told), scaled.low.control(params, VIEW, told)
-    for a, b, old in zip(after, plain.low.control(heard, VIEW, told), before, strict=True):
+    before, after = plain.low.control(params, VIEW, assigned), scaled.low.control(params, VIEW, assigned)
+    for a, b, old in zip(after, plain.low.control(heard, VIEW, assigned), before, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
         assert np.abs(np.asarray(a - old)).max() > 1e-3
 
@@ -337,8 +337,8 @@ def test_the_low_level_turns_with_the_world() -> None:
     assert turns is not None
     params = random_params(agent, 3)
     letters = np.eye(env.num_propositions, dtype=np.float32)
-    told = instruction(letters, network)
-    control = quick_jit(lambda view: agent.low.control(params, View(*view), told))
+    assigned = instruction(letters, network)
+    control = quick_jit(lambda view: agent.low.control(params, View(*view), assigned))
     straight = 0
     for seed in range(10):
         observation, _ = env.reset(jax.random.key(seed), env.default_params)
@@ -359,8 +359,8 @@ def test_the_low_level_is_reflected_with_the_world() -> None:
     agent, mirrors = small_agent(env, small_config(network=network)), env.symmetries
     params = random_params(agent, 3)
     colours = np.eye(4, dtype=np.float32)
-    told = instruction(colours, network)
-    control = quick_jit(lambda view: agent.low.control(params, View(*view), told))
+    assigned = instruction(colours, network)
+    control = quick_jit(lambda view: agent.low.control(params, View(*view), assigned))
     rng = np.random.default_rng(0)
     actions = set()
     for _ in range(10):

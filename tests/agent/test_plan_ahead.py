@@ -78,8 +78,8 @@ def test_the_low_level_remembers_as_much_as_it_is_told_to() -> None:
         network = dataclasses.replace(small_config().network, roles=True, memory=memory)
         agent = small_agent(ENV, small_config(network=network))
         params = random_params(agent, 4)
-        told = agent.low.instruct(params, tree)
-        last = [jax.tree.map(lambda x, e=edge: x[e], told) for edge in (3, 4)]
+        instruction = agent.low.instruct(params, tree)
+        last = [jax.tree.map(lambda x, e=edge: x[e], instruction) for edge in (3, 4)]
         values = [float(agent.low.control(params, ENV.view_at(2), some)[1]) for some in last]
         assert (abs(values[0] - values[1]) > 1e-3) == bool(memory)
 
@@ -89,7 +89,7 @@ def test_advice_is_the_value_of_the_best_way_and_that_way_is_handed_down() -> No
     planner = small_planner(network__advice=10.0)
     agent = small_agent(ENV, small_config(network=network), Ours(high=planner))
     params, view = random_params(agent, 2), ENV.view_at(2)
-    control = quick_jit(lambda told: agent.low.control(params, view, told)[1])
+    control = quick_jit(lambda instruction: agent.low.control(params, view, instruction)[1])
     advise = quick_jit(lambda *batch: planner.advise(agent.low, params, *batch))
     rng = np.random.default_rng(2)
     several = 0
@@ -97,8 +97,8 @@ def test_advice_is_the_value_of_the_best_way_and_that_way_is_handed_down() -> No
         tree = on_device(random_tree(rng, num_nodes=9, num_propositions=ENV.num_propositions, distinct=True))
         labels = jnp.asarray(rng.random(ENV.num_propositions) < 0.4)
         state = advance(tree, initial(tree), labels, TaskTree.NO_NODE)
-        told = agent.low.instruct(params, tree)
-        batch = jax.tree.map(lambda x: x[None], (view, tree, state, told))
+        instruction = agent.low.instruct(params, tree)
+        batch = jax.tree.map(lambda x: x[None], (view, tree, state, instruction))
         advice, ahead = jax.tree.map(lambda x: x[0], advise(*batch))
         for edge in np.flatnonzero(open_edges(tree, state)):
             scores = {}
@@ -108,7 +108,9 @@ def test_advice_is_the_value_of_the_best_way_and_that_way_is_handed_down() -> No
                     later = np.zeros((LENGTH, ENV.num_propositions), np.float32)
                     for i, node in enumerate(way[1 : 1 + LENGTH]):
                         later[i] = tree.reach[node]
-                    mine = dataclasses.replace(jax.tree.map(lambda x, e=edge: x[e], told), ahead=jnp.asarray(later))
+                    mine = dataclasses.replace(
+                        jax.tree.map(lambda x, e=edge: x[e], instruction), ahead=jnp.asarray(later)
+                    )
                     scores[leaf] = float(control(mine)), later
             several += len(scores) > 1
             best = max(score for score, _ in scores.values())

@@ -43,12 +43,12 @@ class ByIndex(HighLevel):
         return {}
 
     def choose(
-        self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, told: Instruction
+        self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, instruction: Instruction
     ) -> Choice:
         index = jnp.arange(tree.num_nodes)
         wish = jnp.where(params["last"], index, -index).astype(jnp.float32)
         logits = jnp.where(jax.vmap(open_edges)(tree, state), wish, -FAR)
-        return Choice(logits, jnp.zeros(len(logits)), jnp.zeros(logits.shape), told.ahead)
+        return Choice(logits, jnp.zeros(len(logits)), jnp.zeros(logits.shape), instruction.ahead)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,16 +74,18 @@ class Walking(LowLevel):
             reach=reach, avoid=avoid, ahead=ahead, behind=ahead[:, :0], future=jnp.zeros((tree.num_nodes, 0))
         )
 
-    def control(self, params: Params, view: View, told: Instruction) -> tuple[jax.Array, jax.Array]:
+    def control(self, params: Params, view: View, instruction: Instruction) -> tuple[jax.Array, jax.Array]:
         """Minus the steps that remain after each action."""
         planes = view[0] > 0  # bool [P, n, n], the agent in the middle cell
 
         def holds(wanted: jax.Array) -> jax.Array:
             return (planes & (wanted > 0)[:, None, None]).any(0)
 
-        after = _distance(jnp.where(holds(told.ahead[0]), 0.0, FAR), jnp.zeros(planes.shape[1:], bool))
-        counts = params["look_ahead"] & told.ahead[0].any()
-        ahead = _distance(jnp.where(holds(told.reach), jnp.where(counts, after, 0.0), FAR), holds(told.avoid))
+        after = _distance(jnp.where(holds(instruction.ahead[0]), 0.0, FAR), jnp.zeros(planes.shape[1:], bool))
+        counts = params["look_ahead"] & instruction.ahead[0].any()
+        ahead = _distance(
+            jnp.where(holds(instruction.reach), jnp.where(counts, after, 0.0), FAR), holds(instruction.avoid)
+        )
         middle = planes.shape[-1] // 2
         rows, columns = (middle + np.array(MOVES)).T % planes.shape[-1]
         return -ahead[rows, columns], jnp.float32(0)

@@ -45,7 +45,7 @@ OF_METHODS = {
     "config.network.whole_task": "ltl2action",
 }
 """Settings that methods have taken the place of: where each was not what it was for ours."""
-OWN = {"option": {f"{_PLANNER}.sharpness": 100.0, f"{_PLANNER}.fading": 0.98}}
+OWN = {"option": {f"{_PLANNER}.sharpness": 100.0, f"{_PLANNER}.decay": 0.98}}
 """Settings of methods without a planner, with the value that the code had before."""
 
 

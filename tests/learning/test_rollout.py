@@ -69,7 +69,7 @@ class Rollout(NamedTuple):
 @quick_jit
 def prepare(params: Any, bank: TaskTree, key: jax.Array) -> tuple[TaskBook, Collector]:
     tasks = jax.tree.map(lambda x: x[:E], bank)
-    book = AGENT.low.open_book(params, jax.tree.map(lambda *x: jnp.concatenate(x), tasks, bank))
+    book = AGENT.low.prepare(params, jax.tree.map(lambda *x: jnp.concatenate(x), tasks, bank))
     layouts = jax.vmap(ENV.sample_layout, (0, None))(jax.random.split(key, E), ENV.default_params)
     worker = start(jax.random.split(key, E), ENV, machine(), book, layouts, jnp.arange(E))
     worker = assign(AGENT, params, book, worker, jnp.zeros((E, 8)))
@@ -233,7 +233,7 @@ def test_what_lies_ahead_is_a_way_to_a_leaf(book: TaskBook, t: Step) -> None:
                 way.insert(0, tree.parent[way[0]])
             if way[0] == edge:
                 ways.append(np.array([*tree.reach[way[1:3]], *np.zeros((2, 4), bool)])[:2])
-        everything = np.asarray(book.told.ahead[t.task[s, e], edge], bool)
+        everything = np.asarray(book.instructions.ahead[t.task[s, e], edge], bool)
         assert any((t.high.ahead[s, e] == way).all() for way in [*ways, everything])
         plans += not (t.high.ahead[s, e] == everything).all()
         if s and not t.high.made[s, e]:
@@ -246,14 +246,14 @@ def flat(x: Any) -> Any:
 
 
 @quick_jit
-def control(params: Any, view: Any, told: Any) -> Any:
-    return jax.vmap(AGENT.low.control, (None, 0, 0))(params, view, told)
+def control(params: Any, view: Any, instruction: Any) -> Any:
+    return jax.vmap(AGENT.low.control, (None, 0, 0))(params, view, instruction)
 
 
 @quick_jit
 def plan_all(params: Any, view: Any, tree: TaskTree, state: TaskState) -> Any:
-    told = jax.vmap(AGENT.low.instruct, (None, 0))(params, tree)
-    choice = AGENT.high.choose(AGENT.low, params, view, tree, state, told)
+    instruction = jax.vmap(AGENT.low.instruct, (None, 0))(params, tree)
+    choice = AGENT.high.choose(AGENT.low, params, view, tree, state, instruction)
     return choice.logits, choice.value
 
 
@@ -262,15 +262,15 @@ def log_probs(logits: Any, choice: np.ndarray) -> np.ndarray:
 
 
 def test_actions_values_and_the_shield(book: TaskBook, t: Step) -> None:
-    told = jax.tree.map(lambda x: x[t.task.ravel(), t.high.edge.ravel()], book.told)
-    told = dataclasses.replace(told, ahead=flat(t.high.ahead))
-    logits, value = control(params(), flat(t.view), told)
+    instruction = jax.tree.map(lambda x: x[t.task.ravel(), t.high.edge.ravel()], book.instructions)
+    instruction = dataclasses.replace(instruction, ahead=flat(t.high.ahead))
+    logits, value = control(params(), flat(t.view), instruction)
     own = ~t.low.shielded.ravel()
     np.testing.assert_allclose(t.low.log_prob.ravel()[own], log_probs(logits, t.low.action.ravel())[own], atol=1e-5)
     np.testing.assert_allclose(t.low.value.ravel(), value, atol=1e-5)
     q = np.asarray(quick_jit(jax.vmap(AGENT.low.reach_values, (None, 0)))(params(), flat(t.view)))
     for i in range(T * E):
-        forbidden, action = pairs(told.avoid[i]), int(t.low.action.ravel()[i])
+        forbidden, action = pairs(instruction.avoid[i]), int(t.low.action.ravel()[i])
         shielded = t.low.shielded.ravel()[i]
         # Of two actions the shield replaced the other one; an action that stands is one that the rule lets stand.
         meant = 1 - action if shielded else action
@@ -344,10 +344,12 @@ def test_cut_episodes_bootstrap_with_the_state_they_were_cut_in(book: TaskBook, 
     assert going_on.sum() > 5
     np.testing.assert_allclose(t.bootstrap.high[-1][going_on], value[-1][going_on], atol=1e-5)
     after = rollouts()[2].after.worker
-    told = jax.tree.map(lambda x: x[after.task, after.decision.edge], book.told)
-    told = jax.tree.map(lambda x: np.repeat(x, T, 0), dataclasses.replace(told, ahead=after.decision.ahead))
+    instruction = jax.tree.map(lambda x: x[after.task, after.decision.edge], book.instructions)
+    instruction = jax.tree.map(
+        lambda x: np.repeat(x, T, 0), dataclasses.replace(instruction, ahead=after.decision.ahead)
+    )
     views = jax.tree.map(lambda x: np.repeat(x, T, 0), after.view)
-    low = np.asarray(control(params(), views, told)[1])[::T]
+    low = np.asarray(control(params(), views, instruction)[1])[::T]
     np.testing.assert_allclose(t.bootstrap.low[-1][going_on], low[going_on], atol=1e-5)
 
 
@@ -372,11 +374,11 @@ def test_targets_of_the_originals_equal_the_reference(t: Step) -> None:
 
 @quick_jit
 def low_log_probs(params: Any, low: LowBatch) -> jax.Array:
-    told = jax.vmap(jax.vmap(AGENT.low.instruct, (None, 0)), (None, 0))(params, low.trees)
+    instruction = jax.vmap(jax.vmap(AGENT.low.instruct, (None, 0)), (None, 0))(params, low.trees)
     row = jnp.arange(low.slot.shape[0])[:, None]
-    told = jax.tree.map(lambda x: x[row, low.slot, low.edge], told)
-    told = dataclasses.replace(told, ahead=low.ahead)
-    logits, _ = jax.vmap(jax.vmap(AGENT.low.control, (None, 0, 0)), (None, 0, 0))(params, low.view, told)
+    instruction = jax.tree.map(lambda x: x[row, low.slot, low.edge], instruction)
+    instruction = dataclasses.replace(instruction, ahead=low.ahead)
+    logits, _ = jax.vmap(jax.vmap(AGENT.low.control, (None, 0, 0)), (None, 0, 0))(params, low.view, instruction)
     return jnp.take_along_axis(jax.nn.log_softmax(logits), low.decision.action[..., None], -1)[..., 0]
 
 
@@ -480,7 +482,7 @@ def test_noise_is_as_correlated_as_it_is_asked_to_be() -> None:
     @quick_jit
     def actions(correlation: jax.Array) -> jax.Array:
         state = Trainer(agent).init(jax.random.key(0), bank, rewards)
-        book = agent.low.open_book(state.params, jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank))
+        book = agent.low.prepare(state.params, jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank))
         pool = fill_pool(jax.random.key(1), agent, book, jnp.int32(0), size=2)
         setting = Setting(agent, state.params, rewards, book, pool)
         return collect(jax.random.key(2), setting, state.collector, correlation)[1].low.action

@@ -198,11 +198,11 @@ def test_greedy_episodes_are_as_short_as_can_be(name: str, best: dict[int, int])
 class ObedientLow(LowLevel):
     """Walks straight to what its sub-task reaches. A low level that learns may go elsewhere when that pays more."""
 
-    def control(self, params: Any, view: Any, told: Any) -> tuple[jax.Array, jax.Array]:
+    def control(self, params: Any, view: Any, instruction: Any) -> tuple[jax.Array, jax.Array]:
         planes, here = view
         cells = jnp.arange(here.shape[0])
-        right = (told.reach @ planes @ cells) > here @ cells
-        return jnp.where(right, 10.0, -10.0) * jnp.array([-1.0, 1.0]), super().control(params, view, told)[1]
+        right = (instruction.reach @ planes @ cells) > here @ cells
+        return jnp.where(right, 10.0, -10.0) * jnp.array([-1.0, 1.0]), super().control(params, view, instruction)[1]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -289,8 +289,8 @@ def test_the_planner_knows_the_values() -> None:
 @pytest.mark.slow
 def test_the_low_level_knows_the_values() -> None:
     params, agent, tree = trained()[0].params, TRAINER.agent, on_device(task("a; b"))
-    told = jax.tree.map(lambda x: x[1], agent.low.instruct(params, tree))
-    _, values = quick_jit(jax.vmap(lambda view: agent.low.control(params, view, told)))(
+    instruction = jax.tree.map(lambda x: x[1], agent.low.instruct(params, tree))
+    _, values = quick_jit(jax.vmap(lambda view: agent.low.control(params, view, instruction)))(
         ENV.view_at(np.array([1, 2, 3]))
     )
     np.testing.assert_allclose(values, GAMMA ** np.array([4, 5, 6]), atol=0.05)

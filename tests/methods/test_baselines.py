@@ -23,7 +23,7 @@ from tests.trees import random_tree, tree_of
 
 ENV = Corridor()
 P = 4
-GAMMA, FADING = 0.9, option.LogicValueIteration().fading
+GAMMA, DECAY = 0.9, option.LogicValueIteration().decay
 
 
 def baseline(name: str, **changes: Any) -> Agent:
@@ -33,16 +33,16 @@ def baseline(name: str, **changes: Any) -> Agent:
     return Agent(ENV, config if name == "option" else method.configure(config), method)
 
 
-def told(agent: Agent, params: Any, tree: TaskTree, state: TaskState, edge: int) -> Instruction:
+def instruction_for(agent: Agent, params: Any, tree: TaskTree, state: TaskState, edge: int) -> Instruction:
     tree = on_device(tree)
     book = agent.low.instruct(params, tree)
     feasible = open_edges(tree, state)
-    return agent.low.told_now(params, book, (), jnp.int32(edge), feasible, book.ahead[edge])
+    return agent.low.instructions_at(params, book, (), jnp.int32(edge), feasible, book.ahead[edge])
 
 
 def behaviour(agent: Agent, params: Any, tree: TaskTree, state: TaskState, edge: int) -> np.ndarray:
     """What describes the low level's policy, and its value, in three cells."""
-    instruction = told(agent, params, tree, state, edge)
+    instruction = instruction_for(agent, params, tree, state, edge)
     views = ENV.view_at(np.array([1, 2, 3]))
     outputs, value = jax.vmap(agent.low.control, (None, 0, None))(params, views, instruction)
     return np.concatenate([outputs, value[:, None]], 1)
@@ -153,18 +153,18 @@ def test_measurements_are_sums_over_attempts_that_fade() -> None:
     ended, reached, last = rng.random((3, *shape)) < 0.6
     duration, reward = rng.integers(1, 9, shape), rng.normal(size=shape).astype(np.float32)
     known = option.measure(
-        option.unmeasured(P), origin, goal, ended, reached, last, duration, reward, discount=GAMMA, fading=FADING
+        option.unmeasured(P), origin, goal, ended, reached, last, duration, reward, discount=GAMMA, decay=DECAY
     )
     for g in range(P):
         here = ended & goal[..., g]
         for o in range(P + 1):
             ours = here & origin[..., o]
-            np.testing.assert_allclose(known.attempts[o, g], FADING + ours.sum(), rtol=1e-5)
+            np.testing.assert_allclose(known.attempts[o, g], DECAY + ours.sum(), rtol=1e-5)
             won = (GAMMA**duration)[ours & reached].sum()
-            np.testing.assert_allclose(known.discounted[o, g], FADING + won, rtol=1e-5)
+            np.testing.assert_allclose(known.discounted[o, g], DECAY + won, rtol=1e-5)
         for kind in (0, 1):
             mine = here & reached & (last == kind)
-            np.testing.assert_allclose(known.successes[kind, g], FADING + mine.sum(), rtol=1e-5)
+            np.testing.assert_allclose(known.successes[kind, g], DECAY + mine.sum(), rtol=1e-5)
             np.testing.assert_allclose(known.rewards[kind, g], reward[mine].sum(), rtol=1e-4, atol=1e-4)
 
 

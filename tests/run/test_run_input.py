@@ -153,7 +153,7 @@ def test_help_shows_the_settings_of_what_was_chosen(capsys: pytest.CaptureFixtur
     assert "--no-shield" in out
     assert "--method.high.transe" in out
     option = shown("--method", "option")
-    assert "--method.high.fading" in option
+    assert "--method.high.decay" in option
     assert "--method.high.transe" not in option
 
 

@@ -82,7 +82,7 @@ class Controller(nn.Module):
         """
         depth = self.config.lookahead if self.config.roles else 0
         embed = self.task_embedding.messages if self.sees == "whole task" else self.task_embedding
-        told = Instruction(
+        instruction = Instruction(
             reach=tree.reach.astype(jnp.float32),
             avoid=subtask_avoid(tree).astype(jnp.float32),
             ahead=lookahead(tree, depth).astype(jnp.float32),
@@ -90,8 +90,10 @@ class Controller(nn.Module):
             future=embed(tree),
         )
         if self.sees == "sub-task":
-            told = dataclasses.replace(told, ahead=jnp.zeros_like(told.ahead), future=jnp.zeros_like(told.future))
-        return told
+            instruction = dataclasses.replace(
+                instruction, ahead=jnp.zeros_like(instruction.ahead), future=jnp.zeros_like(instruction.future)
+            )
+        return instruction
 
     def remaining(
         self, messages: Float32[Array, "*lead N F"], edges: Bool[Array, "*lead N"]
@@ -100,13 +102,13 @@ class Controller(nn.Module):
         return self.task_embedding.of_edges(messages, edges)
 
     def __call__(
-        self, view: tuple[Planes, Shared], told: Instruction
+        self, view: tuple[Planes, Shared], instruction: Instruction
     ) -> tuple[Float32[Array, " outputs"], Float32[Array, ""]]:
         """Acts on one sub-task.
 
         Args:
             view: the observation, as ``env.proposition_view`` gives it.
-            told: the assigned sub-task and what follows.
+            instruction: the assigned sub-task and what follows.
 
         Returns:
             The actor's outputs ``[num_outputs]`` and the value ``[]``.
@@ -114,13 +116,13 @@ class Controller(nn.Module):
         planes, shared = view
         order = signs = None
         if self.config.roles:
-            planes = self._by_role(planes, told)
+            planes = self._by_role(planes, instruction)
             if self.config.symmetric and isinstance(self.symmetries, Symmetries):
-                planes, order = turn(planes, self.symmetries, told.ahead.shape[0])
+                planes, order = turn(planes, self.symmetries, instruction.ahead.shape[0])
             elif self.config.symmetric and isinstance(self.symmetries, Reflections):
-                planes, shared, signs = reflect(planes, shared, self.symmetries, told.ahead.shape[0])
+                planes, shared, signs = reflect(planes, shared, self.symmetries, instruction.ahead.shape[0])
         latent = nn.relu(self.encoder(planes, shared))
-        x = jnp.concatenate([latent, *self._of_task(told)])
+        x = jnp.concatenate([latent, *self._of_task(instruction)])
         outputs = self.actor(x)
         if order is not None:
             outputs = outputs[order]
@@ -135,17 +137,19 @@ class Controller(nn.Module):
         """Touches every parameter, for initialisation."""
         return self(view, jax.tree.map(lambda x: x[0], self.instruct(tree)))
 
-    def _by_role(self, planes: Planes, told: Instruction) -> Float32[Array, "R ..."]:
+    def _by_role(self, planes: Planes, instruction: Instruction) -> Float32[Array, "R ..."]:
         """What is seen of the goal, of what to avoid and of what lies ahead, ``[R, ...]``.
 
         By role the encoder need not push the whole observation through its latent to find the goal afterwards.
         """
-        roles = jnp.tensordot(jnp.concatenate([told.reach[None], told.avoid[None], told.ahead]), planes, axes=1)
+        roles = jnp.tensordot(
+            jnp.concatenate([instruction.reach[None], instruction.avoid[None], instruction.ahead]), planes, axes=1
+        )
         return jnp.concatenate([roles, planes]) if self.config.names else roles
 
-    def _of_task(self, told: Instruction) -> tuple[Float32[Array, " _"], Float32[Array, " F"]]:
+    def _of_task(self, instruction: Instruction) -> tuple[Float32[Array, " _"], Float32[Array, " F"]]:
         """Features of the sub-task and of those before it, scaled, and the embedding of what remains."""
-        future = self.task_embedding.of_sequence(told.ahead) if self.follows_plan else told.future
-        told_now = self.config.task_scale * jnp.concatenate([told.reach, told.avoid, *told.behind])
+        future = self.task_embedding.of_sequence(instruction.ahead) if self.follows_plan else instruction.future
+        current = self.config.task_scale * jnp.concatenate([instruction.reach, instruction.avoid, *instruction.behind])
         # An embedding of the same scale would outweigh the sub-task; without a sub-task it is the only conditioning.
-        return told_now, future * (self.config.task_scale if self.sees == "whole task" else 1.0)
+        return current, future * (self.config.task_scale if self.sees == "whole task" else 1.0)
