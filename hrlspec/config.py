@@ -153,10 +153,6 @@ class RelabelConfig(Checked):
 
     share: float = setting(0.5, least=0, most=1)
     """Share of the environments whose trajectories are trained on a second time, relabelled. 0 switches it off."""
-    corrected: bool = True
-    """Whether a copied action counts by how likely the policy makes it under the new task, relative to the probability
-    that it was drawn with under the old one; a copied choice of the planner relative to 1, for the path was no choice.
-    Off, relative to the new task's own probability before the update."""
     hindsight: bool = False
     """Whether every proposition visited counts as a completed sub-task, and not only those assigned."""
     branch: float = setting(0.7, least=0, most=1)

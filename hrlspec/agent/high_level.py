@@ -12,12 +12,10 @@ from __future__ import annotations
 import abc
 from typing import Any, NamedTuple
 
-import jax
 from flax import struct
-from jaxtyping import Bool, Float32, Int32, Key
+from jaxtyping import Bool, Float32, Key
 
 from envs_jax.arrays import Array
-from hrlspec.agent.distributions import Categorical
 from hrlspec.agent.experience import Experience, HighBatch, Step, View
 from hrlspec.agent.low_level import LowLevel, Params, TaskBook
 from hrlspec.agent.networks.controller import Instruction
@@ -38,9 +36,8 @@ class Choice:
 
 
 class Judgement(NamedTuple):
-    """The high level's log-probability and value of a given choice; leading axis B."""
+    """The high level's value of a task and the low level's advice on its edges; leading axis B."""
 
-    log_prob: Float32[Array, " B"]
     value: Float32[Array, " B"]
     advice: Float32[Array, "B N"]
 
@@ -116,12 +113,10 @@ class HighLevel(abc.ABC):
         tree: TaskTree,
         state: TaskState,
         instructions: Instruction,
-        edge: Int32[Array, " B"],
     ) -> Judgement:
-        """What it thinks of choosing ``edge`` (int32 ``[B]``), which relabelling made the task's own path."""
+        """What it thinks of relabelled tasks, where the choice was not its own."""
         choice = self.choose(low, params, view, tree, state, instructions)
-        log_prob = jax.vmap(Categorical(choice.logits.shape[-1]).log_prob)(choice.logits, edge)
-        return Judgement(log_prob, choice.value, choice.advice)
+        return Judgement(choice.value, choice.advice)
 
     def low_level_rewards(self, experience: Experience) -> Rewards:
         """What the low level is paid, and when that ends: the task's rewards, until the episode ends."""

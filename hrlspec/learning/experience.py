@@ -130,31 +130,32 @@ def copies(
 def _estimates(
     agent: Agent, params: Params, rollout: Step, new: Relabelled, slot: Int32[Array, "E T"]
 ) -> tuple[HighDecision, LowDecision]:
-    """Both levels' log-probabilities and values of the recorded decisions under the new tasks."""
+    """The recorded decisions with both levels' values under the new tasks.
+
+    PPO's ratio is taken to the probability with which an action was drawn, under the old task. A path was no choice of
+    the high level: its ratio is taken to 1.
+    """
     row = (jnp.arange(slot.shape[0])[:, None] * new.tree.parent.shape[1] + slot).reshape(-1)
     fresh = agent.low.prepare(params, jax.tree.map(_flat, new.tree))
     view, edge, node = jax.tree.map(_flat, (rollout.view, new.assigned, new.node))
     instructions = _instructions(agent, params, fresh, row, edge, node, new)
-    outputs, value = jax.vmap(agent.low.control, in_axes=(None, 0, 0))(params, view, instructions)
-    log_prob = jax.vmap(agent.low.actions.log_prob)(outputs, _flat(rollout.low.action))
-    judgement = _judged(agent, params, fresh, view, row, node, edge, _flat(new.decided))
+    _, value = jax.vmap(agent.low.control, in_axes=(None, 0, 0))(params, view, instructions)
+    judgement = _judged(agent, params, fresh, view, row, node, _flat(new.decided))
 
     def shaped(x: Shaped[Array, "R ..."]) -> Shaped[Array, "E T ..."]:
         return x.reshape((*slot.shape, *x.shape[1:]))
 
-    corrected = agent.config.relabel.corrected
     high = HighDecision(
         made=new.decided,
         edge=new.assigned,
         ahead=shaped(instructions.ahead),
-        # The path was no choice: its probability counts relative to 1.
-        log_prob=jnp.zeros_like(new.reward) if corrected else shaped(judgement.log_prob),
+        log_prob=jnp.zeros_like(new.reward),
         value=shaped(judgement.value),
         advice=shaped(judgement.advice),
     )
     low = LowDecision(
         action=rollout.low.action,
-        log_prob=rollout.low.log_prob if corrected else shaped(log_prob),
+        log_prob=rollout.low.log_prob,
         value=shaped(value),
         shielded=rollout.low.shielded,
     )
@@ -227,22 +228,20 @@ def _judged(
     view: View,
     row: Int32[Array, " R"],
     node: Int32[Array, " R"],
-    edge: Int32[Array, " R"],
     decided: Bool[Array, " R"],
 ) -> Judgement:
     """The high level's estimates of the completed path's choices, leading axis R; zeros where there was none."""
 
-    def judge(inputs: tuple[View, Array, Array, Array]) -> Judgement:
-        view, row, node, edge = inputs
+    def judge(inputs: tuple[View, Array, Array]) -> Judgement:
+        view, row, node = inputs
         tree, instructions = jax.tree.map(lambda x: x[row], (fresh.tree, fresh.instructions))
         state = dataclasses.replace(jax.vmap(initial)(tree), node=node)
-        return agent.high.judge(agent.low, params, view, tree, state, instructions, edge)
+        return agent.high.judge(agent.low, params, view, tree, state, instructions)
 
-    nothing = jnp.zeros(decided.shape)
-    unknown = Judgement(nothing, nothing, jnp.zeros((*decided.shape, fresh.tree.num_nodes)))
+    unknown = Judgement(jnp.zeros(decided.shape), jnp.zeros((*decided.shape, fresh.tree.num_nodes)))
     if agent.high.ppo is None:
         return unknown
-    return in_groups(judge, decided, (view, row, node, edge), unknown, JUDGED_AT_ONCE)
+    return in_groups(judge, decided, (view, row, node), unknown, JUDGED_AT_ONCE)
 
 
 def _flat(x: Shaped[Array, "E T ..."]) -> Shaped[Array, "..."]:

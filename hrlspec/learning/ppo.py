@@ -47,7 +47,7 @@ def policy_loss(
 ) -> Float32[Array, ""]:
     """Clipped surrogate; ``old`` is what the ratio is taken to.
 
-    That is the log-probability with which a sample was drawn; for relabelled ones see `RelabelConfig.corrected`.
+    That is the log-probability with which a sample was drawn: of a relabelled action, under the task of then.
 
     Where the advantage is negative the plain surrogate has no bound. With ``dual_clip`` it has (Ye et al., 2020): what
     has become so much likelier during the update counts no more.

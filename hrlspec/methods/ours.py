@@ -96,16 +96,14 @@ class ImplicitPlanner(Checked, HighLevel):
         tree: TaskTree,
         state: TaskState,
         instructions: Instruction,
-        edge: Int32[Array, " B"],
     ) -> Judgement:
         """See :class:`HighLevel`.
 
         A copy ends in success and its returns are known: the planner is evaluated only where its outputs are used.
         """
         if self.learns_from_copies or self.max_operator:
-            return super().judge(low, params, view, tree, state, instructions, edge)
-        nothing = jnp.zeros(edge.shape)
-        return Judgement(nothing, nothing, self.advise(low, params, view, tree, state, instructions)[0])
+            return super().judge(low, params, view, tree, state, instructions)
+        return Judgement(jnp.zeros(state.node.shape), self.advise(low, params, view, tree, state, instructions)[0])
 
     def advise(
         self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, instructions: Instruction

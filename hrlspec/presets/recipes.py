@@ -120,10 +120,7 @@ _HRLSPEC = Settings(
             "curriculum.tree_share": 0.5,
             "curriculum.earlier": 0.4,
             "curriculum.contested": 0.7,
-            # Correction changes nothing in Letter and Walk; in Zone it is better, but the records of this recipe were
-            # made without.
             "relabel.share": 0.25,
-            "relabel.corrected": False,
             # The policy learns to avoid by itself; shielded steps are lost to it.
             "shield.enabled": False,
         },

@@ -138,7 +138,6 @@ def test_what_distinguishes_the_recipes(name: str) -> None:
     assert (paper.curriculum.tree_share, paper.curriculum.contested) == (0, 0)  # sequences alone
     assert paper.shield.enabled
     assert paper.relabel.share == 0.5
-    assert paper.relabel.corrected
     assert (planner.max_operator, planner.learns_unfinished, planner.learns_from_copies) == (True, False, True)
     assert (planner.network.rounds, planner.network.advice, planner.transe) == (8, 0, 0.01)
     ours, planner = config_of(name), planner_of(name)
@@ -146,7 +145,6 @@ def test_what_distinguishes_the_recipes(name: str) -> None:
     assert ours.network.symmetric
     assert ours.curriculum.tree_share == 0.5
     assert not ours.shield.enabled
-    assert not ours.relabel.corrected
     assert (planner.max_operator, planner.learns_unfinished, planner.learns_from_copies) == (False, True, False)
     assert (planner.network.rounds, planner.network.advice, planner.transe) == (0, 400, 0.01)
 
