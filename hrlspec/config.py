@@ -9,10 +9,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import typing
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Any, Literal, TypeVar
 
 S = TypeVar("S")
+_WORDS = {int: "a whole number", float: "a number", bool: "True or False", str: "text", type(None): "None"}
 
 
 class ConfigError(ValueError):
@@ -25,16 +28,45 @@ def setting(default: Any, *, least: float = -math.inf, most: float = math.inf) -
 
 
 class Checked:
-    """Base of settings: a value out of its field's range is refused when the settings are made."""
+    """Base of settings: a value of another type than its field's, or out of its range, is refused at once."""
 
     def __post_init__(self) -> None:
+        hints = typing.get_type_hints(type(self))
         for field in dataclasses.fields(self):  # type: ignore[arg-type]
             least, most = field.metadata.get("range", (-math.inf, math.inf))
-            found = getattr(self, field.name)
+            found, hint = getattr(self, field.name), hints[field.name]
+            if not _fits(found, hint):
+                raise ConfigError(f"{type(self).__name__}.{field.name} is {found!r}, expected {_words(hint)}")
             for value in found if isinstance(found, tuple) else (found,):
                 if isinstance(value, int | float) and not least <= value <= most:
                     bounds = f"at least {least:g}" if most == math.inf else f"a number from {least:g} to {most:.10g}"
                     raise ConfigError(f"{type(self).__name__}.{field.name} is {found}, expected {bounds}")
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value is of a type: a class, a union, a literal, or a tuple of such. Of other types anything is."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, UnionType):
+        return any(_fits(value, argument) for argument in arguments)
+    if origin is Literal:
+        return value in arguments
+    if origin is tuple:
+        return isinstance(value, tuple) and all(_fits(entry, arguments[0]) for entry in value)
+    if hint in (int, float):
+        return isinstance(value, int if hint is int else int | float) and not isinstance(value, bool)
+    return not isinstance(hint, type) or isinstance(value, hint)
+
+
+def _words(hint: Any) -> str:
+    """A type in words."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, UnionType):
+        return " or ".join(map(_words, arguments))
+    if origin is Literal:
+        return "one of " + ", ".join(map(str, arguments))
+    if origin is tuple:
+        return f"a tuple, each entry {_words(arguments[0])}"
+    return _WORDS.get(hint, getattr(hint, "__name__", str(hint)))
 
 
 @dataclasses.dataclass(frozen=True)

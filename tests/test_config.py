@@ -150,6 +150,15 @@ def test_bounds_are_included_and_nothing_beyond_them_is(kind: type, name: str) -
     ("wrong", "message"),
     [
         (lambda: Config(num_envs=0), "Config.num_envs is 0, expected at least 1"),
+        (lambda: Config(num_envs=1.5), "Config.num_envs is 1.5, expected a whole number"),
+        (lambda: Config(num_envs=True), "Config.num_envs is True, expected a whole number"),
+        (lambda: PPOConfig(clip="0.2"), "PPOConfig.clip is '0.2', expected a number"),
+        (
+            lambda: NetworkConfig(actor=[64, 64]),
+            r"NetworkConfig.actor is \[64, 64\], expected a tuple, each entry a whole number",
+        ),
+        (lambda: NetworkConfig(roles=1), "NetworkConfig.roles is 1, expected True or False"),
+        (lambda: Config(low={}), "Config.low is {}, expected PPOConfig"),
         (lambda: Config(discount=1.5), "Config.discount is 1.5, expected a number from 0 to 1"),
         (lambda: NetworkConfig(actor=(64, -64)), r"NetworkConfig.actor is \(64, -64\), expected at least 1"),
         (lambda: PPOConfig(dual_clip=1.1), r"PPOConfig.dual_clip is 1.1, expected at least 1 \+ clip, 1.2"),
