@@ -1,20 +1,28 @@
-"""docs/new_environment.md: its code runs, and the environment in it keeps the contract."""
+"""docs/new_environment.md and docs/other_environments.md: their code runs, and their environments keep the contract."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import io
 import re
+import warnings
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
+import hrlspec
 from envs_jax import Environment
 from tests.envs import test_contract as contract
 
-PAGE = Path(__file__).parents[2] / "docs" / "new_environment.md"
-BLOCKS = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE, OTHERS = DOCS / "new_environment.md", DOCS / "other_environments.md"
+BLOCKS, (ROOMS, TRAIN_ROOMS, REACHER, TRAIN_REACHER) = (
+    re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL) for page in (PAGE, OTHERS)
+)
 
 
 @functools.cache
@@ -74,3 +82,24 @@ def test_the_rest_of_the_page_runs(capsys: pytest.CaptureFixture[str]) -> None:
     subtask, success = capsys.readouterr().out.splitlines()
     assert subtask == "('achieve red',)"
     assert 0 <= float(success) <= 1
+
+
+@pytest.mark.filterwarnings("ignore:Brax System", "ignore:Accessing `.*` directly from `Data`:DeprecationWarning")
+@pytest.mark.parametrize(
+    ("needs", "world", "train"), [("gymnax", ROOMS, TRAIN_ROOMS), ("brax", REACHER, TRAIN_REACHER)]
+)
+def test_worlds_of_others_are_trained(needs: str, world: str, train: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """As the page has it, with fewer steps and smaller sizes."""
+    pytest.importorskip(needs)
+    names: dict[str, Any] = {
+        "__name__": "other_environments",
+        "SMALL": {**SMALL, "num_steps": 64},
+        "hrlspec": hrlspec,
+        "jax": jax,
+    }
+    short = re.sub(r"total_steps=[\d_]+", "total_steps=1, changes=SMALL", train)
+    # What brax says of what it does not find, and of what it imports.
+    with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings(action="ignore"):
+        exec(compile(world, str(OTHERS), "exec", dont_inherit=True), names)
+    exec(compile(short.replace("episodes=100", "episodes=10"), str(OTHERS), "exec", dont_inherit=True), names)
+    assert re.fullmatch(r"success [01]\.\d{3}", capsys.readouterr().out.splitlines()[-1])
