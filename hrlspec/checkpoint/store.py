@@ -10,7 +10,8 @@ numbers. A checkpoint is a folder::
         manifest.json    metadata, the description of every leaf, the SHA-256 of every file under arrays/
         manifest.sha256  the SHA-256 of manifest.json, in the format of ``sha256sum -c``
 
-It is written under a temporary name, flushed to the disk and renamed, so a folder of that name is always complete.
+It is written under a temporary name, flushed to the disk, read back and renamed, so a folder of that name is always
+complete, and older ones are deleted only then.
 One process writes; several processes that save into the same folder at once are out of scope.
 """
 
@@ -24,6 +25,7 @@ import logging
 import os
 import re
 import shutil
+import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -63,6 +65,7 @@ FORMAT = 1
 _ARRAYS, _MANIFEST, _SEAL = "arrays", "manifest.json", "manifest.sha256"
 _STEP_NAME = re.compile(r"step_(\d{12,})")
 _SAVING, _REPLACED = ".saving_", ".replaced_"
+_PLAIN = re.compile(r"[A-Za-z0-9_./-]*")
 
 _log = logging.getLogger("hrlspec.checkpoint")
 
@@ -139,6 +142,7 @@ def save(
         ValueError: ``step`` or ``keep`` is out of range, or two leaves have the same path.
         TypeError: a leaf or the metadata cannot be stored.
         OSError: the file system refused; the checkpoints that were there are untouched.
+        CheckpointDamagedError: what was written is not what is read; again they are untouched.
     """
     if step < 0 or keep < 1:
         raise ValueError(f"a checkpoint needs step >= 0 and keep >= 1, found step = {step} and keep = {keep}")
@@ -217,8 +221,6 @@ def load(
 
 def _write(folder: Path, leaves: Mapping[str, Leaf], metadata: Mapping[str, Any]) -> None:
     """Writes arrays, manifest and seal into an empty folder and flushes them to the disk."""
-    import orbax.checkpoint as ocp  # takes a second to import, and only checkpoints need it
-
     # Orbax knows the leaves by their number: paths may hold characters that mean something to it. It refuses
     # zero-size arrays, which their kind restores anyway.
     arrays = {
@@ -227,8 +229,14 @@ def _write(folder: Path, leaves: Mapping[str, Leaf], metadata: Mapping[str, Any]
         if isinstance(leaf.value, np.ndarray) and leaf.value.size
     }
     if arrays:
-        with _silent(), ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as checkpointer:
-            checkpointer.save(folder / _ARRAYS, arrays)
+        with _orbax(folder) as (_, checkpointer, path):
+            try:
+                checkpointer.save(path, arrays)
+            except Exception as error:  # the storage's own, of several types
+                raise error if isinstance(error, OSError) else OSError(" ".join(str(error).split())[:200]) from error
+        read = _read_arrays(folder)
+        if read.keys() != arrays.keys() or any(read[name].tobytes() != arrays[name].tobytes() for name in arrays):
+            raise CheckpointDamagedError(f"checkpoint {folder} is damaged: what was written is not what is read")
     files = {}
     for path in sorted(folder.rglob("*")):
         _flush(path)
@@ -331,18 +339,16 @@ def _check_fit(folder: Path, stored: Mapping[str, Kind], wanted: Mapping[str, An
 
 def _read_arrays(folder: Path) -> dict[str, np.ndarray]:
     """What orbax wrote."""
-    import orbax.checkpoint as ocp
-
-    arrays = (folder / _ARRAYS).absolute()  # of others orbax finds no metadata
-    if not arrays.exists():  # every leaf is empty or a Python number
+    if not (folder / _ARRAYS).exists():  # every leaf is empty or a Python number
         return {}
-    try:
-        with _silent(), ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as checkpointer:
+    with _orbax(folder) as (ocp, checkpointer, arrays):
+        try:
             names = checkpointer.metadata(arrays).item_metadata.tree.keys()
             as_numpy = {name: ocp.RestoreArgs(restore_type=np.ndarray) for name in names}
             return checkpointer.restore(arrays, args=ocp.args.PyTreeRestore(restore_args=as_numpy))
-    except Exception as error:  # whatever orbax and its storage raise on content that they cannot read
-        raise CheckpointDamagedError(f"checkpoint {folder} is damaged: {' '.join(str(error).split())[:200]}") from error
+        except Exception as error:  # whatever orbax and its storage raise on content that they cannot read
+            said = " ".join(str(error).split())[:200]
+            raise CheckpointDamagedError(f"checkpoint {folder} is damaged: {said}") from error
 
 
 # Small things -----------------------------------------------------------------------------------------------------
@@ -389,12 +395,30 @@ def _versions() -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def _silent() -> Iterator[None]:
-    """Keeps orbax, which logs through absl, off the terminal."""
+def _orbax(folder: Path) -> Iterator[tuple[Any, Any, Path]]:
+    """Orbax, its checkpointer, and the path of the checkpoint's arrays as orbax can be told it."""
+    import orbax.checkpoint as ocp  # takes a second to import, and only checkpoints need it
+
     logger = logging.getLogger("absl")
     level = logger.level
-    logger.setLevel(logging.CRITICAL)
+    logger.setLevel(logging.CRITICAL)  # orbax logs through absl, to the terminal
     try:
-        yield
+        with (
+            _plainly_named(folder.absolute()) as plain,
+            ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as checkpointer,
+        ):
+            yield ocp, checkpointer, plain / _ARRAYS
     finally:
         logger.setLevel(level)
+
+
+@contextlib.contextmanager
+def _plainly_named(folder: Path) -> Iterator[Path]:
+    """A path to the folder without what orbax and its storage read as patterns, escapes and names of services."""
+    if _PLAIN.fullmatch(str(folder)):
+        yield folder
+        return
+    with tempfile.TemporaryDirectory() as scratch:
+        link = Path(scratch, "folder")
+        link.symlink_to(folder, target_is_directory=True)
+        yield link

@@ -102,6 +102,27 @@ def test_a_relative_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         assert state_hash(load(folder, empty_like(state)).state) == state_hash(state)
 
 
+@pytest.mark.parametrize(
+    "name",
+    ["lr[0.1]", "[!a]", "**", "back\\slash", "gs:", "file://x", "%41", "a?b#c", "{a,b}", "~", "two\nlines", "\udcff"],
+)
+def test_every_path_works(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / name
+    try:
+        folder.mkdir(parents=True)
+    except (OSError, UnicodeError):
+        pytest.skip("no name for this file system")
+    state = {"w": np.arange(3.0)}
+    save(folder, 1, state)
+    save(folder, 2, {"w": np.ones(3)})
+    assert state_hash(load(folder, state, step=1).state) == state_hash(state)
+    monkeypatch.chdir(folder)
+    save("here", 1, state)
+    restored = load("here", state)
+    assert state_hash(restored.state) == state_hash(state)
+    assert restored.skipped == ()
+
+
 def test_an_abstract_target_and_a_part_of_the_state(tmp_path: Path) -> None:
     state = make_state()
     save(tmp_path, 1, state)
@@ -287,6 +308,47 @@ def test_a_failed_save_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest
             save(tmp_path, step, make_state(5))
     assert sorted(path.name for path in tmp_path.iterdir()) == before
     assert state_hash(load(tmp_path, state).state) == state_hash(state)
+
+
+@pytest.mark.parametrize("read", [{}, {"0": np.zeros(4)}])
+def test_what_cannot_be_read_back_replaces_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read: dict[str, np.ndarray]
+) -> None:
+    state = {"w": jnp.arange(4.0)}
+    save(tmp_path, 1, state, keep=1)
+    monkeypatch.setattr(store, "_read_arrays", lambda folder: read)
+    with pytest.raises(CheckpointDamagedError, match="what was written is not what is read"):
+        save(tmp_path, 2, state, keep=1)
+    monkeypatch.undo()
+    assert load(tmp_path, state).step == 1
+    assert [entry.name for entry in tmp_path.iterdir()] == ["step_000000000001"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such limits")
+def test_a_disk_that_is_full_is_an_error_of_the_system(tmp_path: Path) -> None:
+    """A limit on the size of files stands for the disk; it is for good, so it is set in a process of its own."""
+    script = (
+        "import resource, sys, numpy as np\n"
+        "from hrlspec.checkpoint import load, save\n"
+        "small, large = {'w': np.zeros(10)}, {'w': np.random.default_rng(0).random(100_000)}\n"
+        "save(sys.argv[1], 1, small)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))\n"
+        "try:\n"
+        "    save(sys.argv[1], 2, large)\n"
+        "except OSError:\n"
+        "    print(load(sys.argv[1], small).step)\n"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", script, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        env=dict(os.environ, JAX_PLATFORMS="cpu"),
+        cwd=Path(__file__).parents[2],
+    )
+    assert (ended.stdout, ended.stderr, ended.returncode) == ("1\n", "", 0)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["step_000000000001"]
 
 
 def test_what_cannot_be_stored_is_refused(tmp_path: Path) -> None:

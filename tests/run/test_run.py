@@ -77,7 +77,7 @@ def results(folder: Path) -> Any:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An uninterrupted run."""
-    folder = tmp_path_factory.mktemp("runs") / "whole"
+    folder = tmp_path_factory.mktemp("runs") / "lr[0.1] \\ any"  # every path works
     assert call(*tiny.arguments(folder)) == 0
     return folder
 
