@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Int, Int32, Shaped, UInt32
 
 from hrlspec import spec
-from hrlspec.spec import SpecError, TaskTree, parse, task_hashes, tree_to_text
+from hrlspec.spec import SpecError, TaskTree, bare_lines, parse, task_hashes, tree_to_text
 
 MAX_NODES = 256
 """Default for the largest tree of a suite."""
@@ -62,7 +62,7 @@ def suite_from_text(name: str, text: str, propositions: Sequence[str], *, max_no
     """Reads a suite: one formula a line; ``#`` begins a comment, blank lines are skipped.
 
     Args:
-        name: of the suite.
+        name: of the suite, and of the text in errors.
         text: the lines.
         propositions: names of the P propositions.
         max_nodes: tasks with larger trees are refused.
@@ -71,18 +71,16 @@ def suite_from_text(name: str, text: str, propositions: Sequence[str], *, max_no
         SpecError: with the line and column in ``text`` of the first mistake, or if there is no formula.
     """
     formulas, trees = [], []
-    for number, line in enumerate(text.splitlines(), 1):
-        formula = line.split("#", 1)[0].strip()
-        if not formula:
+    for number, line in enumerate(bare_lines(text), 1):
+        if not line.strip():
             continue
         try:
-            trees.append(spec.compile_task(parse(formula), propositions, max_nodes))
+            trees.append(spec.compile_task(parse(line, line=number), propositions, max_nodes))
         except SpecError as error:
-            column = None if error.column is None else error.column + line.index(formula)
-            raise SpecError(error.message, number, column or 1) from None
-        formulas.append(formula)
+            raise SpecError(error.message, number, error.column or 1, name) from None
+        formulas.append(" ".join(line.split()))
     if not formulas:
-        raise SpecError(f"{name}: found no formula, expected one on each line")
+        raise SpecError("found no formula, expected one on each line", source=name)
     return Suite(name, tuple(formulas), _stack(trees))
 
 

@@ -6,7 +6,7 @@ from hrlspec.spec.compiler import compile_task
 from hrlspec.spec.draw import draw_task
 from hrlspec.spec.hashing import task_hash, task_hashes
 from hrlspec.spec.monitor import RUNNING, SATISFIED, VIOLATED, TaskState, advance, initial, open_edges
-from hrlspec.spec.parser import parse
+from hrlspec.spec.parser import bare_lines, parse
 from hrlspec.spec.semantics import satisfies
 from hrlspec.spec.subtasks import Subtask, subtasks
 from hrlspec.spec.syntax import (
@@ -46,6 +46,7 @@ __all__ = [
     "TaskTree",
     "Then",
     "advance",
+    "bare_lines",
     "compile_task",
     "draw_task",
     "initial",

@@ -12,6 +12,7 @@ An ``or`` after a condition joins two tasks if a task follows it (parentheses as
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 from hrlspec.spec.syntax import (
@@ -54,11 +55,12 @@ class _Token:
         return self.position.error(f"found {found}, expected {expected}")
 
 
-def parse(text: str) -> Formula:
+def parse(text: str, *, line: int = 1) -> Formula:
     """Reads one SPECTRL formula.
 
     Args:
         text: see ``docs/language.md``; may span lines and hold ``#`` comments.
+        line: number of its first line, where it is part of a larger text.
 
     Raises:
         SpecError: with line, column, what was found and what was expected; also beyond the limits on length
@@ -68,16 +70,21 @@ def parse(text: str) -> Formula:
     if not isinstance(text, str):
         raise TypeError(f"parse takes a string, found {type(text).__name__}")
     if len(text) > MAX_TEXT:
-        raise SpecError(f"the text has {len(text):,} characters, at most {MAX_TEXT:,} are read", 1, 1)
-    formula = _Parser(_tokens(text)).whole()
+        raise SpecError(f"the text has {len(text):,} characters, at most {MAX_TEXT:,} are read", line, 1)
+    formula = _Parser(_tokens(text, line)).whole()
     check(formula)
     return formula
 
 
-def _tokens(text: str) -> list[_Token]:
+def bare_lines(text: str) -> list[str]:
+    """The lines of a text, without comments and without a byte order mark at its beginning."""
+    return [line.split("#", 1)[0] for line in re.split("\r\n|\r|\n", text.removeprefix(_BYTE_ORDER_MARK))]
+
+
+def _tokens(text: str, line: int) -> list[_Token]:
     """Splits the text, ending with an empty token."""
     tokens: list[_Token] = []
-    line, line_start, i = 1, 0, 0
+    line_start = i = 0
     if text.startswith(_BYTE_ORDER_MARK):
         line_start = i = 1
     while i < len(text):

@@ -30,16 +30,22 @@ class SpecError(ValueError):
         message: what was found and what was expected.
         line: 1-based line, ``None`` for a formula that was not parsed from text.
         column: 1-based column in characters, ``None`` likewise.
+        source: name of the text that the line is of, such as a file's; ``None`` where there is one text alone.
     """
 
-    def __init__(self, message: str, line: int | None = None, column: int | None = None) -> None:
-        super().__init__(message, line, column)
+    def __init__(
+        self, message: str, line: int | None = None, column: int | None = None, source: str | None = None
+    ) -> None:
+        super().__init__(message, line, column, source)
         self.message = message
         self.line = line
         self.column = column
+        self.source = source
 
     def __str__(self) -> str:
-        return self.message if self.line is None else f"line {self.line}, column {self.column}: {self.message}"
+        place = None if self.line is None else f"line {self.line}, column {self.column}"
+        where = ", ".join(part for part in (self.source, place) if part)
+        return f"{where}: {self.message}" if where else self.message
 
 
 class SpecWarning(UserWarning):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hrlspec.evaluation import suite_from_text, suite_from_trees
-from hrlspec.spec import SpecError
+from hrlspec.spec import SpecError, SpecWarning
 from hrlspec.tasks.sampling import sample_trees
 
 LETTERS = ("a", "b", "c", "d", "e")
@@ -25,13 +25,32 @@ def test_comments_blank_lines_and_depths():
     [
         ("achieve a\n  achieve z\n", "line 2, column"),
         ("achieve a\n\n  achieve a and and b", "line 3, column 17"),
-        ("# nothing\n\n", "no formula"),
+        ("\ufeff# marked\n\nachieve z", "^wrong, line 3, column 9: unknown proposition 'z'"),
+        ("achieve a\fachieve b", "^wrong, line 1, column 11: found 'achieve'"),
+        ("achieve a\r\n \tachieve (b or c", r"line 2, column 18: .* for the '\(' at line 2, column 11"),
+        ("# nothing\n\n", "^wrong: found no formula"),
         ("", "no formula"),
     ],
 )
 def test_mistakes_say_where(text, place):
     with pytest.raises(SpecError, match=place):
         suite_from_text("wrong", text, LETTERS)
+
+
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+@pytest.mark.parametrize("first", ["# a comment", "", " ", "achieve c"])
+@pytest.mark.parametrize("end", ["\n", "\r", "\r\n"])
+def test_lines_end_where_the_language_says(mark, first, end):
+    """Other white space separates words, and a byte order mark means nothing; the formula is kept on one line."""
+    space = "\f\v\u2028\u2029\x85\x1c\x1d\x1e\u00a0"
+    text = mark + first + end + space.join(["", "achieve", "a;", "achieve", "b", ""]) + end
+    assert suite_from_text("odd", text, LETTERS).formulas[-1] == "achieve a; achieve b"
+    assert len(suite_from_text("odd", text, LETTERS)) == (2 if "achieve" in first else 1)
+
+
+def test_warnings_say_the_line():
+    with pytest.warns(SpecWarning, match="line 2, column 18: alternatives left out"):
+        suite_from_text("warned", "achieve c\nachieve (a or b) ensuring not a", LETTERS)
 
 
 def test_too_large_a_tree_is_refused_with_its_line():

@@ -43,7 +43,7 @@ BAD_FLAGS: list[tuple[Sequence[str], str]] = [
     (("--run", "run", "--spec-file", "."), "cannot read .: Is a directory"),
     (("--run", "run", "--spec-file", "binary"), "binary: not UTF-8"),
     (("--run", "run", "--spec-file", "empty"), "found no formula"),
-    (("--run", "run", "--spec-file", "wrong"), "line 3, column 9"),
+    (("--run", "run", "--spec-file", "wrong"), "wrong, line 3, column 9: "),
     (("--run", "run", "--suite", "dag", "--episodes", "0"), "--episodes is 0"),
     (("--run", "run", "--suite", "dag", "--episodes", "many"), "--episodes"),
     (("--run", "run", "--suite", "dag", "--seed", "-3"), "--seed is -3"),
@@ -99,5 +99,5 @@ def test_bad_input_in_a_process_of_its_own(place: Path) -> None:
     command = [sys.executable, "-m", "experiments.evaluate", "--run", str(place / "run"), "--spec", "achieve a or"]
     ended = subprocess.run([*command, "--json"], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert (ended.returncode, ended.stdout) == (2, "")
-    assert ended.stderr.startswith("error: line 1, column ")
+    assert ended.stderr.startswith("error: --spec, line 1, column ")
     assert ended.stderr.count("\n") == 1

@@ -28,6 +28,7 @@ from hrlspec.run.flags import parse_flags
 from hrlspec.run.folder import read_record
 from hrlspec.run.tables import result_console, suite_table
 from hrlspec.run.unseen import with_tasks
+from hrlspec.spec import bare_lines
 
 MOST_PICTURES = 9
 _LARGEST_FILE = 1_000_000  # bytes
@@ -145,7 +146,7 @@ def tasks_of(flags: EvaluateFlags, experiment: Experiment) -> Suite:
         return with_tasks(experiment.preset, flags.run, experiment.seed).suite(flags.suite)
     if flags.spec is not None:
         # A task may be written over several lines; a suite has one on each.
-        name, text = "--spec", " ".join(line.split("#", 1)[0] for line in flags.spec.splitlines())
+        name, text = "--spec", " ".join(bare_lines(flags.spec))
     else:
         assert flags.spec_file is not None
         name, text = flags.spec_file.name, _read(flags.spec_file)
