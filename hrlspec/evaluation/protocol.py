@@ -54,7 +54,7 @@ class SuiteEvaluation:
         episodes = run_episodes(
             key, agent, params, machine, cases.trees, cases.layouts, chunk=_even(len(cases), self.chunk), **how
         )
-        return score_suite(cases, episodes, horizon=agent.env.horizon, **how)
+        return score_suite(cases, episodes, machine, horizon=agent.env.horizon, **how)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +84,7 @@ class ReturnEvaluation:
             greedy=self.greedy,
             chunk=_even(len(cases), self.chunk),
         )
-        return score_returns(cases, episodes, greedy=self.greedy)
+        return score_returns(cases, episodes, machine, greedy=self.greedy)
 
 
 @dataclasses.dataclass(frozen=True)

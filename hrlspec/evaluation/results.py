@@ -1,6 +1,8 @@
 """Results of evaluations and their JSON form.
 
-Intervals have 95 % coverage and account for the correlation of episodes of one task (:mod:`hrlspec.evaluation.stats`).
+Intervals have 95 % coverage. From ten tasks on they are over tasks: what would come out on other tasks of the kind,
+with the correlation of episodes of one task accounted for. Fewer tasks say too little about others; their intervals are
+over episodes: what would come out in other episodes on these tasks. See :mod:`hrlspec.evaluation.stats`.
 """
 
 from __future__ import annotations
@@ -15,6 +17,9 @@ from hrlspec.evaluation.stats import Interval
 ESTIMATES = ("success_rate", "violation_rate", "return_mean", "steps_mean", "spl")
 """The estimates of a :class:`Score`; each has ``<name>_interval`` beside it in JSON."""
 
+OVER_TASKS, OVER_EPISODES = "tasks", "episodes"
+"""What intervals are over."""
+
 _REFERENCES = ("optimal_steps_mean", "myopic_success_rate", "myopic_spl")
 
 
@@ -24,6 +29,7 @@ class Score:
 
     Attributes:
         episodes: how many.
+        intervals_over: ``tasks``, or ``episodes`` on these tasks where there are fewer than ten.
         success_rate: task satisfied within the horizon.
         violation_rate: task violated, or episode ended by the environment.
         return_mean: undiscounted sum of rewards.
@@ -37,6 +43,7 @@ class Score:
     """
 
     episodes: int
+    intervals_over: str
     success_rate: Interval
     violation_rate: Interval
     return_mean: Interval
@@ -48,7 +55,7 @@ class Score:
 
     def to_json(self) -> dict[str, Any]:
         """Plain numbers and lists; what is not known or cannot be estimated is ``None``."""
-        result: dict[str, Any] = {"episodes": self.episodes}
+        result: dict[str, Any] = {"episodes": self.episodes, "intervals_over": self.intervals_over}
         for name in ESTIMATES:
             result |= interval_to_json(name, getattr(self, name))
         return result | {name: getattr(self, name) for name in _REFERENCES}
@@ -61,6 +68,7 @@ class Score:
             estimates["spl"] = None
         return cls(
             episodes=data["episodes"],
+            intervals_over=data.get("intervals_over", OVER_TASKS),  # older results do not say
             **{name: data[name] for name in _REFERENCES},
             **estimates,
         )
@@ -146,17 +154,19 @@ class ReturnResult:
         greedy: whether actions and sub-tasks were the most likely ones rather than sampled.
         episodes: how many cases.
         excluded: pairs of task and layout left out because their branches' optima differ too little.
+        intervals_over: ``tasks``, or ``episodes`` on these tasks where there are fewer than ten.
         ratio: of the agent.
         success_rate: of the agent on the same episodes.
         random_branch: ratio of an agent that draws its first edge uniformly and is optimal from then on.
         longest_branch: ratio of one that takes the longest branch and is optimal from then on.
-        per_depth: the agent's ratio by depth of the task.
+        per_depth: the agent's ratio by depth of the task, without bounds over tasks where they are fewer than ten.
     """
 
     suite: str
     greedy: bool
     episodes: int
     excluded: int
+    intervals_over: str
     ratio: Interval
     success_rate: Interval
     random_branch: float
@@ -170,6 +180,7 @@ class ReturnResult:
             "actions": "greedy" if self.greedy else "sampled",
             "episodes": self.episodes,
             "excluded": self.excluded,
+            "intervals_over": self.intervals_over,
             **interval_to_json("return_over_optimum", self.ratio),
             **interval_to_json("success_rate", self.success_rate),
             "random_branch": self.random_branch,
@@ -215,11 +226,12 @@ class ChoiceResult:
 
 
 def interval_to_json(name: str, interval: Interval | None) -> dict[str, Any]:
-    """``{name: estimate, name_interval: [low, high]}``, with ``None`` for NaN."""
-    if interval is None:
-        return {name: None, f"{name}_interval": None}
-    estimate, low, high = (None if math.isnan(number) else float(number) for number in interval)
-    return {name: estimate, f"{name}_interval": [low, high]}
+    """``{name: estimate, name_interval: [low, high]}``; ``None`` where there is no estimate or there are no bounds."""
+    estimate, *bounds = interval or (math.nan,) * 3
+    return {
+        name: None if math.isnan(estimate) else float(estimate),
+        f"{name}_interval": None if any(map(math.isnan, bounds)) else [float(bound) for bound in bounds],
+    }
 
 
 def interval_from_json(name: str, data: Mapping[str, Any]) -> Interval:

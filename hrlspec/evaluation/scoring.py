@@ -10,9 +10,18 @@ from jaxtyping import Bool, Float, Float32, Int, Real
 
 from hrlspec.evaluation.cases import BranchCases, Cases
 from hrlspec.evaluation.episodes import Episodes
-from hrlspec.evaluation.results import ChoiceResult, ReturnResult, Score, SuiteResult, TaskScore
-from hrlspec.evaluation.stats import Interval, mean_interval, rate_interval
+from hrlspec.evaluation.results import (
+    OVER_EPISODES,
+    OVER_TASKS,
+    ChoiceResult,
+    ReturnResult,
+    Score,
+    SuiteResult,
+    TaskScore,
+)
+from hrlspec.evaluation.stats import Interval, bounded_interval, mean_interval, rate_interval
 from hrlspec.exact.contested import ContestedSuite
+from hrlspec.tasks.rewards import RewardMachine, return_bounds
 
 
 def path_ratio(
@@ -22,12 +31,19 @@ def path_ratio(
     return np.where(success, optimum / np.maximum(taken, optimum), 0).astype(np.float32)
 
 
-def score_suite(cases: Cases, episodes: Episodes, *, horizon: int, greedy: bool, shield: bool) -> SuiteResult:
+FEW_TASKS = 10
+"""With fewer tasks intervals are over the episodes, given these tasks: the variance between tasks is hardly known."""
+
+
+def score_suite(
+    cases: Cases, episodes: Episodes, machine: RewardMachine, *, horizon: int, greedy: bool, shield: bool
+) -> SuiteResult:
     """Scores of one episode per case: over all, per depth and per task.
 
     Args:
         cases: B cases.
         episodes: their outcomes, leading axis B.
+        machine: the rewards of the episodes.
         horizon: of the environment, for the myopic agent too.
         greedy: how actions were chosen.
         shield: whether the shield was on.
@@ -35,7 +51,7 @@ def score_suite(cases: Cases, episodes: Episodes, *, horizon: int, greedy: bool,
     depth = cases.suite.depths[cases.task]
 
     def score(where: Int[np.ndarray, " _"]) -> Score:
-        return _score(cases, episodes, where, horizon)
+        return _score(cases, episodes, where, horizon, return_bounds(machine, int(depth[where].max())))
 
     return SuiteResult(
         suite=cases.suite.name,
@@ -51,20 +67,27 @@ def score_suite(cases: Cases, episodes: Episodes, *, horizon: int, greedy: bool,
     )
 
 
-def score_returns(cases: BranchCases, episodes: Episodes, *, greedy: bool) -> ReturnResult:
+def score_returns(cases: BranchCases, episodes: Episodes, machine: RewardMachine, *, greedy: bool) -> ReturnResult:
     """Return over optimum of one episode per case, and that of the reference agents on the same cases."""
     ratio = np.asarray(episodes.returns) / cases.optimum
     depth = cases.suite.depths[cases.task]
+    least = return_bounds(machine, int(depth.max()))[0] / float(cases.optimum.min())
+    over = _over(cases.task)
+
+    def mean(where: Bool[np.ndarray, " B"]) -> Interval:
+        return _mean(ratio[where], cases.task[where], over, (least, 1.0))
+
     return ReturnResult(
         suite=cases.suite.name,
         greedy=greedy,
         episodes=len(cases),
         excluded=cases.excluded,
-        ratio=_mean(ratio, cases.task),
-        success_rate=rate_interval(episodes.success, tasks=cases.task),
+        intervals_over=over,
+        ratio=mean(depth == depth),
+        success_rate=_rate(np.asarray(episodes.success), cases.task, over),
         random_branch=float((cases.random / cases.optimum).mean()),
         longest_branch=float((cases.longest / cases.optimum).mean()),
-        per_depth={int(d): _mean(ratio[depth == d], cases.task[depth == d]) for d in np.unique(depth)},
+        per_depth={int(d): mean(depth == d) for d in np.unique(depth)},
     )
 
 
@@ -95,23 +118,27 @@ def score_choices(
     )
 
 
-def _score(cases: Cases, episodes: Episodes, where: Int[np.ndarray, " _"], horizon: int) -> Score:
-    """Of the given cases."""
+def _score(
+    cases: Cases, episodes: Episodes, where: Int[np.ndarray, " _"], horizon: int, returns: tuple[float, float]
+) -> Score:
+    """Of the given cases, whose returns lie between the given bounds."""
     task = cases.task[where]
+    over = _over(task)
     success, steps = np.asarray(episodes.success)[where], np.asarray(episodes.steps)[where]
     spl = optimal_steps = myopic_success = myopic_spl = None
     if cases.optimum is not None and cases.myopic is not None:
         optimum, myopic = cases.optimum[where], cases.myopic[where]
         arrives = myopic <= horizon
-        spl = _clip(_mean(path_ratio(success, steps, optimum), task))
+        spl = _mean(path_ratio(success, steps, optimum), task, over, (0, 1))
         optimal_steps = float(optimum[success].mean()) if success.any() else None
         myopic_success, myopic_spl = float(arrives.mean()), float(path_ratio(arrives, myopic, optimum).mean())
     return Score(
         episodes=len(where),
-        success_rate=rate_interval(success, tasks=task),
-        violation_rate=rate_interval(np.asarray(episodes.violated)[where], tasks=task),
-        return_mean=_mean(np.asarray(episodes.returns)[where], task),
-        steps_mean=_mean(steps[success], task[success]),
+        intervals_over=over,
+        success_rate=_rate(success, task, over),
+        violation_rate=_rate(np.asarray(episodes.violated)[where], task, over),
+        return_mean=_mean(np.asarray(episodes.returns)[where], task, over, returns),
+        steps_mean=_mean(steps[success], task[success], over, (1, horizon)),
         spl=spl,
         optimal_steps_mean=optimal_steps,
         myopic_success_rate=myopic_success,
@@ -119,11 +146,27 @@ def _score(cases: Cases, episodes: Episodes, where: Int[np.ndarray, " _"], horiz
     )
 
 
-def _mean(values: Real[np.ndarray, " _"], task: Int[np.ndarray, " _"]) -> Interval:
-    """The mean with episodes grouped by task; those of a single task are independent given the task."""
-    return mean_interval(values, tasks=task if len(np.unique(task)) > 1 else None)
+def _over(task: Int[np.ndarray, " _"]) -> str:
+    """What the intervals of episodes on these tasks are over."""
+    return OVER_EPISODES if len(np.unique(task)) < FEW_TASKS else OVER_TASKS
 
 
-def _clip(interval: Interval) -> Interval:
-    """Bounds kept within [0, 1], where the quantity lies."""
-    return Interval(interval.estimate, max(0.0, interval.low), min(1.0, interval.high))
+def _rate(outcomes: Bool[np.ndarray, " _"], task: Int[np.ndarray, " _"], over: str) -> Interval:
+    return rate_interval(outcomes, tasks=task if over == OVER_TASKS else None)
+
+
+def _mean(
+    values: Real[np.ndarray, " _"], task: Int[np.ndarray, " _"], over: str, bounds: tuple[float, float]
+) -> Interval:
+    """The mean of numbers between the given bounds; over tasks it has an interval only if enough of them have a number.
+
+    Over episodes these count as independent. That is rather too wide: as many episodes of each of the given tasks vary
+    less in their mean than episodes whose tasks are drawn at random.
+    """
+    if over == OVER_EPISODES:
+        return bounded_interval(values, *bounds)
+    mean, *ends = mean_interval(values, tasks=task)
+    if len(np.unique(task)) < FEW_TASKS:
+        return Interval(mean, np.nan, np.nan)
+    low, high = np.clip(ends, *bounds)
+    return Interval(mean, float(low), float(high))

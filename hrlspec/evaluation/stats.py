@@ -1,8 +1,8 @@
 """Estimates with confidence intervals, for few seeds and many episodes.
 
 Axes: **S** seeds (or runs), **M** tasks. Episodes of one task are correlated, so rates and means over episodes accept
-``tasks`` and widen their intervals accordingly. The aggregates over seeds are those of
-Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice" (2021).
+``tasks`` and widen their intervals accordingly; `bounded_interval` is for episodes of a few given tasks. The aggregates
+over seeds are those of Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice" (2021).
 """
 
 from __future__ import annotations
@@ -76,10 +76,42 @@ def rate_interval(outcomes: ArrayLike, *, tasks: ArrayLike | None = None, confid
     variance = rate * (1 - rate)
     if tasks is not None and variance > 0 and groups.max() > 0:
         trials = min(trials, variance / max(_standard_error(sample, groups) ** 2, 1e-12))
-    centre = (rate + z**2 / (2 * trials)) / (1 + z**2 / trials)
-    half = z / (1 + z**2 / trials) * np.sqrt(variance / trials + z**2 / (4 * trials**2))
-    # At 0 and 1 one bound is the rate itself, up to rounding.
-    return Interval(rate, min(max(centre - half, 0.0), rate), max(min(centre + half, 1.0), rate))
+    return Interval(rate, *_wilson(rate, trials, z))
+
+
+def bounded_interval(values: ArrayLike, low: float, high: float, *, confidence: float = 0.95) -> Interval:
+    """The mean of independent numbers that lie between ``low`` and ``high``, with an interval that lies there too.
+
+    Wilson's interval with Student's quantile. The numbers count as many as would be as informative if they were all
+    at the ends, where their variance is largest: more than they are where they vary less. Their variance includes one
+    more number, at ``low``, since a few episodes often show no failure although there are some.
+
+    Of a few numbers Student's own interval passes the ends, and if they are all the same it has no width: for four
+    episodes that succeed with probability 0.96 it covers this in 13 % of cases, the one here in 99 %.
+
+    Args:
+        values: numbers ``[n]``, finite.
+        low: the least that is possible.
+        high: the most.
+        confidence: coverage of the interval.
+
+    Returns:
+        All NaN without values; NaN bounds with a single one.
+    """
+    sample = _finite(values, 1)
+    size = sample.size
+    mean = float(sample.mean()) if size else np.nan
+    if size < 2:
+        return Interval(mean, np.nan, np.nan)
+    if not low < high:
+        return Interval(mean, mean, mean)
+    scaled = (sample - low) / (high - low)
+    rate = float(np.clip(scaled.mean(), 0, 1))
+    spread = (((scaled - rate) ** 2).sum() + rate**2) / (size - 1)
+    trials = max(1.0, rate * (1 - rate) / spread) * size if spread else float(size)
+    bounds = _wilson(rate, trials, float(scipy.special.stdtrit(size - 1, (1 + _checked(confidence)) / 2)))
+    below, above = (low + (high - low) * bound for bound in bounds)
+    return Interval(mean, min(below, mean), max(above, mean))
 
 
 def interquartile_mean(scores: ArrayLike) -> float:
@@ -137,6 +169,15 @@ def probability_of_improvement(
     rng = np.random.default_rng(seed)
     draws = np.array([improvement(_resample(first, rng), _resample(second, rng)) for _ in range(resamples)])
     return Interval(improvement(first, second), *_percentiles(draws, confidence))
+
+
+def _wilson(rate: float, trials: float, quantile: float) -> tuple[float, float]:
+    """Bounds of Wilson's interval."""
+    shrink = 1 + quantile**2 / trials
+    centre = (rate + quantile**2 / (2 * trials)) / shrink
+    half = quantile / shrink * float(np.sqrt(rate * (1 - rate) / trials + quantile**2 / (4 * trials**2)))
+    # At 0 and 1 one bound is the rate itself, up to rounding.
+    return min(max(centre - half, 0.0), rate), max(min(centre + half, 1.0), rate)
 
 
 def _standard_error(sample: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"]) -> float:

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hrlspec.evaluation import Aggregate, SuiteResult
+from hrlspec.evaluation.results import OVER_EPISODES, OVER_TASKS
 from hrlspec.evaluation.stats import Interval
 from hrlspec.run.learner import FinalResults
 
@@ -31,13 +32,16 @@ def result_console() -> Console:
 def suite_table(result: SuiteResult) -> Table:
     """Success, return, steps and SPL with intervals, in all and per depth; fits into 80 columns."""
     total, names = result.total, [name for name in _NAMES if name != "spl" or result.total.spl is not None]
+    few = total.intervals_over == OVER_EPISODES
     remarks = [
         "greedy actions" if result.greedy else "sampled actions",
         *(["shield on"] if result.shield else []),
-        "95 % intervals",
+        "95 % intervals over the episodes, given these tasks" if few else "95 % intervals over tasks",
         "steps of successful episodes",
         f"violated: {total.violation_rate.estimate:.3f}",
     ]
+    if not few and any(score.intervals_over == OVER_EPISODES for score in result.per_depth.values()):
+        remarks.append("* over the episodes, given these tasks")
     if result.excluded:
         remarks.append(f"{result.excluded} cases that nothing can satisfy in time were left out")
     if total.optimal_steps_mean:
@@ -50,7 +54,8 @@ def suite_table(result: SuiteResult) -> Table:
         "; ".join(remarks),
     )
     for depth, score in sorted(result.per_depth.items()):
-        table.add_row(f"depth {depth}", *(_cell(getattr(score, name)) for name in names))
+        mark = "" if few or score.intervals_over == OVER_TASKS else "*"
+        table.add_row(f"depth {depth}{mark}", *(_cell(getattr(score, name)) for name in names))
     table.add_section()
     table.add_row("all", *(_cell(getattr(total, name)) for name in names), style="bold")
     return table

@@ -85,6 +85,12 @@ def reward_machine(
     )
 
 
+def return_bounds(machine: RewardMachine, depth: int) -> tuple[float, float]:
+    """What no return of an episode is below and none above, on a task with ``depth`` edges on its longest path."""
+    parts = np.concatenate([[machine.completion], np.full(depth, machine.subtask), machine.bonus])
+    return float(np.minimum(parts, 0).sum()), float(np.maximum(parts, 0).sum())
+
+
 def initial(machine: RewardMachine) -> Int32[Array, " R"]:
     """Every rule waiting, int32 ``[R]``."""
     return jnp.full(machine.num_rules, RewardMachine.WAITING, jnp.int32)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 
+import jax
 import numpy as np
 import pytest
 
@@ -13,10 +13,12 @@ import envs_jax
 from hrlspec.evaluation import BranchCases, Cases, Score, SuiteResult, aggregate, suite_from_text
 from hrlspec.evaluation.episodes import Episodes
 from hrlspec.evaluation.scoring import path_ratio, score_choices, score_returns, score_suite
-from hrlspec.evaluation.stats import Interval, interquartile_mean, mean_interval, rate_interval
+from hrlspec.evaluation.stats import Interval, bounded_interval, interquartile_mean, mean_interval, rate_interval
 from hrlspec.exact.contested import ContestedSuite
+from hrlspec.tasks.rewards import reward_machine
 
-SUITE = suite_from_text("two", "achieve a\nachieve b; achieve c", envs_jax.make("letter").propositions)
+LETTERS = envs_jax.make("letter").propositions
+SUITE = suite_from_text("two", "achieve a\nachieve b; achieve c", LETTERS)
 TASK = np.array([0, 0, 1, 1])
 EPISODES = Episodes(
     success=np.array([True, True, False, True]),
@@ -24,6 +26,7 @@ EPISODES = Episodes(
     steps=np.array([2, 8, 3, 5], np.int32),
     returns=np.array([1.0, 1.0, 0.5, 2.0], np.float32),
 )
+MACHINE = reward_machine(LETTERS, subtask=0.5)
 CASES = Cases(
     suite=SUITE,
     task=TASK,
@@ -35,7 +38,7 @@ CASES = Cases(
 
 
 def _score(cases: Cases = CASES, episodes: Episodes = EPISODES) -> SuiteResult:
-    return score_suite(cases, episodes, horizon=75, greedy=True, shield=False)
+    return score_suite(cases, episodes, MACHINE, horizon=75, greedy=True, shield=False)
 
 
 def test_path_ratio():
@@ -48,9 +51,9 @@ def test_totals_by_hand():
     result = _score()
     total = result.total
     assert (total.episodes, result.excluded, result.suite) == (4, 3, "two")
-    assert total.success_rate == rate_interval([1, 1, 0, 1], tasks=TASK)
+    assert total.success_rate == rate_interval([1, 1, 0, 1])
     assert total.violation_rate.estimate == 0.25
-    assert total.return_mean == mean_interval([1, 1, 0.5, 2], tasks=TASK)
+    assert total.return_mean == bounded_interval([1, 1, 0.5, 2], 0, 2)
     assert total.steps_mean.estimate == 5  # of 2, 8 and 5: the failed episode does not count
     assert total.spl.estimate == pytest.approx((1 + 0.5 + 0 + 1) / 4)
     assert 0 <= total.spl.low <= total.spl.high <= 1
@@ -64,9 +67,63 @@ def test_depths_and_tasks_by_hand():
     assert [(each.task, each.depth) for each in result.per_task] == [("achieve a", 1), ("achieve b; achieve c", 2)]
     assert result.per_task[0].score == result.per_depth[1]
     assert result.per_task[1].score.spl.estimate == 0.5
-    # Episodes of a single task are independent given the task.
-    assert result.per_task[0].score.return_mean == Interval(1, 1, 1)
-    assert math.isfinite(result.per_task[1].score.return_mean.low)
+    # Episodes of a single task are independent given the task; the most that this one can give is 1.5.
+    assert result.per_task[0].score.return_mean == bounded_interval([1, 1], 0, 1.5)
+    assert result.per_task[0].score.intervals_over == "episodes"
+
+
+def _outcomes(success: np.ndarray, steps: np.ndarray) -> Episodes:
+    returns = success.astype(np.float32)
+    return Episodes(success=success, violated=~success, steps=steps.astype(np.int32), returns=returns)
+
+
+def _many(tasks: int, outcomes: Episodes) -> Score:
+    """Of the outcomes of one task, repeated for several."""
+    depth_two = suite_from_text("many", "achieve b; achieve c\n" * tasks, LETTERS)
+    size = len(outcomes.success)
+    cases = Cases(depth_two, np.arange(tasks).repeat(size), CASES.layouts, None, None, 0)
+    repeated = jax.tree.map(lambda x: np.tile(x, tasks), outcomes)
+    return score_suite(cases, repeated, MACHINE, horizon=75, greedy=True, shield=False).total
+
+
+def test_from_ten_tasks_on_intervals_are_over_tasks():
+    few, many = _many(9, EPISODES), _many(10, EPISODES)
+    assert (few.intervals_over, many.intervals_over) == ("episodes", "tasks")
+    assert few.success_rate == rate_interval(np.tile(EPISODES.success, 9))
+    tasks = np.arange(10).repeat(4)
+    assert many.success_rate == rate_interval(np.tile(EPISODES.success, 10), tasks=tasks)
+    assert many.return_mean == mean_interval(np.tile(EPISODES.returns, 10), tasks=tasks)
+
+
+@pytest.mark.parametrize("tasks", [1, 2, 3, 9, 10, 12])
+def test_intervals_hold_nothing_impossible(tasks: int):
+    """Tasks that differ much: the variance between two of them says next to nothing about others."""
+    text = "".join(f"achieve {'b' if row % 2 else 'c'}\n" for row in range(tasks))
+    suite, rng = suite_from_text("few", text, LETTERS), np.random.default_rng(tasks)
+    task = np.arange(tasks).repeat(50)
+    success = rng.random(task.size) < np.where(task % 2, 1, 0.9)
+    steps = np.where(task % 2, 70, 3) + rng.integers(0, 6, task.size)
+    optimum = np.full(task.size, 3, np.float32)
+    cases = Cases(suite, task, np.zeros((task.size, 1)), optimum, optimum, 0)
+    episodes = _outcomes(success, steps)
+    machine = reward_machine(LETTERS)
+    total = score_suite(cases, episodes, machine, horizon=75, greedy=True, shield=False).total
+    possible = {"return_mean": (0, 1), "spl": (0, 1), "success_rate": (0, 1), "steps_mean": (1, 75)}
+    for name, (low, high) in possible.items():
+        found = getattr(total, name)
+        assert low <= found.low < found.estimate < found.high <= high, name
+    if total.intervals_over == "episodes":  # success and return are the same numbers here
+        np.testing.assert_allclose(total.return_mean, total.success_rate, atol=0.01)
+
+
+def test_steps_of_few_tasks_among_many_have_no_interval():
+    tasks = np.arange(12)
+    suite = suite_from_text("many", "achieve b\n" * 12, LETTERS)
+    cases = Cases(suite, tasks, np.zeros((12, 1)), None, None, 0)
+    success = tasks < 3
+    total = score_suite(cases, _outcomes(success, tasks + 1), MACHINE, horizon=75, greedy=True, shield=False).total
+    data = json.loads(json.dumps(total.to_json(), allow_nan=False))
+    assert (data["intervals_over"], data["steps_mean"], data["steps_mean_interval"]) == ("tasks", 2.0, None)
 
 
 def test_json_keys_and_round_trip():
@@ -78,8 +135,15 @@ def test_json_keys_and_round_trip():
     assert {"episodes", "per_task", "per_depth", "actions", "excluded"} <= set(data)
     assert data["per_depth"]["2"]["success_rate"] == data["per_task"][1]["success_rate"] == 0.5
     # One episode alone succeeded at depth 2, so its steps have no interval.
-    assert data["per_depth"]["2"]["steps_mean_interval"] == [None, None]
+    assert data["per_depth"]["2"]["steps_mean_interval"] is None
+    assert data["intervals_over"] == data["per_task"][0]["intervals_over"] == "episodes"
     assert SuiteResult.from_json(data).to_json() == data
+
+
+def test_results_that_do_not_say_what_intervals_are_over():
+    data = _score().to_json()
+    del data["intervals_over"]
+    assert SuiteResult.from_json(data).total.intervals_over == "tasks"
 
 
 def test_all_failed_is_json_too():
@@ -109,11 +173,13 @@ def test_returns_by_hand():
         longest=np.array([0, 2, 1, 4], np.float32),
         excluded=2,
     )
-    result = score_returns(cases, EPISODES, greedy=False)
+    result = score_returns(cases, EPISODES, MACHINE, greedy=False)
     assert result.ratio.estimate == pytest.approx((1 + 0.5 + 0.5 + 0.5) / 4)
     assert result.random_branch == pytest.approx((1 + 0.5 + 0.5 + 0.75) / 4)
     assert result.longest_branch == 0.75
     assert result.per_depth[2].estimate == 0.5
+    assert 0 <= result.ratio.low < result.ratio.estimate < result.ratio.high <= 1
+    assert result.to_json()["intervals_over"] == "episodes"
     assert result.to_json()["return_over_optimum"] == pytest.approx(0.625)
 
 

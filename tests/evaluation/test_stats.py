@@ -8,6 +8,7 @@ import scipy.stats
 
 from hrlspec.evaluation.stats import (
     Interval,
+    bounded_interval,
     interquartile_mean,
     mean_interval,
     probability_of_improvement,
@@ -60,6 +61,35 @@ def test_a_rate_has_wilsons_interval(successes: int, trials: int, confidence: fl
     found = rate_interval(outcomes(successes, trials), confidence=confidence)
     np.testing.assert_allclose(found, (successes / trials, expected.low, expected.high), atol=1e-12)
     assert 0 <= found.low <= found.estimate <= found.high <= 1
+
+
+def test_a_bounded_mean_of_zeros_and_ones_has_nearly_wilsons_interval() -> None:
+    values = outcomes(190, 200)
+    np.testing.assert_allclose(bounded_interval(values, 0, 1), rate_interval(values), atol=2e-3)
+    stretched = np.array(bounded_interval(3 + 2 * values, 3, 5))
+    np.testing.assert_allclose(stretched, 3 + 2 * np.array(bounded_interval(values, 0, 1)))
+
+
+def test_a_bounded_mean_stays_within_its_bounds() -> None:
+    for values in ([0.0, 0.0], [1.0, 1.0], [0.0, 1.0], [1.0] * 50, [0.97, 0.98, 0.99], [0.999] * 3):
+        found = bounded_interval(values, 0, 1)
+        assert 0 <= found.low <= found.estimate <= found.high <= 1
+        assert found.low < found.high
+    assert bounded_interval([2.0, 2.0], 2, 2) == (2, 2, 2)
+    np.testing.assert_equal(tuple(bounded_interval([], 0, 1)), (np.nan,) * 3)
+    np.testing.assert_equal(tuple(bounded_interval([0.4], 0, 1)), (0.4, np.nan, np.nan))
+
+
+@pytest.mark.parametrize("size", [2, 4, 10, 40])
+@pytest.mark.parametrize("failures", [0.0, 0.04, 0.3])
+def test_a_bounded_mean_is_covered_by_few_values(size: int, failures: float) -> None:
+    """Values of SPL: 0 for a failure, else somewhat below 1. Student's interval covers as little as 70 % of cases."""
+    rng = np.random.default_rng(6)
+    draws = (rng.random((1000, size)) >= failures) * rng.beta(20, 2, (1000, size))
+    mean = (1 - failures) * 20 / 22
+    found = [bounded_interval(values, 0, 1) for values in draws]
+    coverage = np.mean([interval.low <= mean <= interval.high for interval in found])
+    assert coverage > 0.95 - 4 * np.sqrt(0.95 * 0.05 / 1000)
 
 
 def test_wilsons_interval_in_closed_form() -> None:

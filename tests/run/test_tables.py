@@ -16,9 +16,10 @@ from hrlspec.run.tables import aggregate_table, final_tables, suite_table
 NAN = float("nan")
 
 
-def score(success: float, *, spl: bool = True) -> Score:
+def score(success: float, *, spl: bool = True, over: str = "tasks") -> Score:
     return Score(
         episodes=1000,
+        intervals_over=over,
         success_rate=Interval(success, success - 0.1, 1.0),
         violation_rate=Interval(0.012, 0.0, 0.1),
         return_mean=Interval(success, -0.123, 1.2),
@@ -56,6 +57,20 @@ def test_a_suite() -> None:
         assert remark in text
 
 
+def test_it_says_what_intervals_are_over() -> None:
+    many = result()
+    some = dataclasses.replace(many, per_depth={2: score(0.5), 3: score(0.5, over="episodes")})
+    few = dataclasses.replace(some, total=score(0.5, over="episodes"))
+    texts = [" ".join(" ".join(lines(suite_table(each))).split()) for each in (many, some, few)]
+    assert [("intervals over tasks" in text, "* over the episodes, given" in text) for text in texts] == [
+        (True, False),
+        (True, True),
+        (False, False),
+    ]
+    assert "depth 3* " in texts[1]
+    assert "95 % intervals over the episodes, given these tasks;" in texts[2]
+
+
 def test_bounds_lose_their_leading_zero_alone() -> None:
     total = dataclasses.replace(score(0.5), steps_mean=Interval(9.925, 9.56, 10.29))
     assert "[9.56,10.29]" in "".join(lines(suite_table(dataclasses.replace(result(), total=total))))
@@ -67,7 +82,9 @@ def test_without_an_exact_solver_there_is_no_spl() -> None:
 
 def test_what_a_run_ends_with() -> None:
     choice = ChoiceResult(False, 400, *[Interval(0.9, 0.85, 0.95)] * 3, failures=0.01)
-    returns = ReturnResult("branches", False, 100, 5, Interval(0.95, 0.9, 1.0), Interval(1, 1, 1), 0.5, 0.75, {})
+    returns = ReturnResult(
+        "branches", False, 100, 5, "tasks", Interval(0.95, 0.9, 1.0), Interval(1, 1, 1), 0.5, 0.75, {}
+    )
     text = "\n".join("\n".join(lines(table)) for table in final_tables(FinalResults(result(), choice, returns)))
     assert "Contested choice (400 layouts)" in text
     assert "0.900 [.85,.95]" in text
