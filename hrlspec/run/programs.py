@@ -10,9 +10,11 @@ import contextlib
 import functools
 import hashlib
 import importlib.metadata
+import logging
 import os
 import pickle
 import platform
+import stat
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -28,6 +30,10 @@ from hrlspec.run.platform import compiler_options
 
 KEPT = 64
 """Programs in the folder; those used least recently go first."""
+
+_OTHERS_MAY_WRITE = stat.S_IWGRP | stat.S_IWOTH
+
+_log = logging.getLogger("hrlspec.run")
 
 
 class Program:
@@ -90,14 +96,38 @@ def _use_cache(enabled: bool) -> None:
 
 
 def _folder() -> Path | None:
-    """Next to JAX's own cache, and only where that is used."""
+    """Next to JAX's own cache, and only where that is used; ``None`` where others could put code of theirs."""
     settings = jax.config.values
-    folder = settings["jax_compilation_cache_dir"] if settings["jax_enable_compilation_cache"] else None
-    return Path(folder) / "hrlspec-programs" if folder else None
+    cache = settings["jax_compilation_cache_dir"] if settings["jax_enable_compilation_cache"] else None
+    return _own(Path(cache) / "hrlspec-programs") if cache and "://" not in cache else None
+
+
+@functools.cache
+def _own(folder: Path) -> Path | None:
+    """The folder, made if missing; ``None``, said once, if it is not this user's alone to write to."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        reason = _not_own(folder.lstat())
+    except OSError as error:
+        reason = f"{error.strerror}"
+    if reason is None:
+        return folder
+    _log.warning("compiled programs are not kept in %s: %s; set JAX_COMPILATION_CACHE_DIR to another", folder, reason)
+    return None
+
+
+def _not_own(found: os.stat_result) -> str | None:
+    """What is wrong if others may have written there; loading a program runs code."""
+    if not hasattr(os, "geteuid") or found.st_uid != os.geteuid():
+        return "it belongs to somebody else"
+    return "others may write there" if found.st_mode & _OTHERS_MAY_WRITE or stat.S_ISLNK(found.st_mode) else None
 
 
 def _load(file: Path, args: tuple[Any, ...]) -> Callable[..., Any]:
-    payload, result = pickle.loads(file.read_bytes())
+    with file.open("rb") as stream:
+        if reason := _not_own(os.fstat(stream.fileno())):
+            raise PermissionError(reason)
+        payload, result = pickle.load(stream)
     os.utime(file)
     in_tree = jax.tree.structure((args, {}))
     program: Any = serialize_executable.deserialize_and_load(payload, in_tree, jax.tree.structure(result))
@@ -108,9 +138,9 @@ def _save(file: Path, compiled: jax.stages.Compiled) -> None:
     payload, _, out_tree = serialize_executable.serialize(compiled)
     # Structures of trees cannot be stored, but trees can.
     content = pickle.dumps((payload, jax.tree.unflatten(out_tree, range(out_tree.num_leaves))))
-    file.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=file.parent, prefix=".") as scratch:
         whole = Path(scratch, file.name)
+        whole.touch(mode=0o600)
         whole.write_bytes(content)
         whole.replace(file)
     known = sorted(file.parent.glob("[!.]*"), key=lambda path: path.stat().st_mtime, reverse=True)

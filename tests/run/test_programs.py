@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import functools
+import os
+import pickle
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -30,6 +33,7 @@ def folder(tmp_path: Path) -> Iterator[Path]:
     before = jax.config.values["jax_compilation_cache_dir"]
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     jax.clear_caches()
+    programs._own.cache_clear()
     traced.clear()
     yield tmp_path / "hrlspec-programs"
     jax.config.update("jax_compilation_cache_dir", before)
@@ -93,6 +97,68 @@ def test_without_a_place_everything_works_as_before(folder: Path) -> None:
     jax.config.update("jax_compilation_cache_dir", None)
     assert run() == 12
     assert not folder.exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such permissions")
+@pytest.mark.parametrize("mode", [0o775, 0o757])
+def test_a_folder_that_others_may_write_to_is_not_used(
+    folder: Path, mode: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    run()
+    (file,) = folder.iterdir()
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert file.stat().st_mode & 0o777 == 0o600
+    programs._own.cache_clear()
+    folder.chmod(mode)
+    assert (run(), run(size=5)) == (12, 15)
+    assert traced == [3, 3, 3]
+    assert list(folder.iterdir()) == [file]
+    (line,) = caplog.messages
+    assert line.startswith(f"compiled programs are not kept in {folder}: others may write there")
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+def test_what_belongs_to_somebody_else_is_not_loaded(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, kind: str
+) -> None:
+    run()
+    if kind == "folder":
+        programs._own.cache_clear()
+    user = os.geteuid()
+    monkeypatch.setattr(os, "geteuid", lambda: user + 1)
+    monkeypatch.setattr(pickle, "load", lambda stream: pytest.fail("unpickled"))
+    assert run() == 12
+    assert traced == [3, 3]
+    assert ["it belongs to somebody else" in line for line in caplog.messages] == [True] * (kind == "folder")
+
+
+def test_a_link_to_a_folder_is_not_used(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (folder.parent / "elsewhere").mkdir(mode=0o700)
+    folder.symlink_to(folder.parent / "elsewhere", target_is_directory=True)
+    assert run() == 12
+    assert not list(folder.iterdir())
+    assert "others may write there" in caplog.text
+
+
+def test_a_file_that_others_may_write_to_is_made_anew(folder: Path) -> None:
+    run()
+    (file,) = folder.iterdir()
+    file.chmod(0o660)
+    assert (run(), run()) == (12, 12)
+    assert traced == [3, 3]
+    assert file.stat().st_mode & 0o777 == 0o600
+
+
+@pytest.mark.parametrize("place", ["gs://bucket/cache", "file"])
+def test_no_place_for_programs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, place: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    jax.config.update("jax_compilation_cache_dir", place)
+    assert programs._folder() is None
+    assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
+    assert len(caplog.messages) == (place == "file")
 
 
 def test_kept_only_if_it_may_be(folder: Path) -> None:
