@@ -25,6 +25,7 @@ import json
 import math
 import os
 import platform
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -40,6 +41,7 @@ from hrlspec.version import __version__
 FORMAT = 1
 _LOCK = ".lock"
 _LEFT_BY_A_KILL = {_LOCK, ".config.json.new"}  # all that a process killed at once after its start leaves
+_BEGUN = (*_LEFT_BY_A_KILL, "config.json", "tensorboard")  # what `open_run` makes
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "orbax-checkpoint")
 
 
@@ -169,11 +171,53 @@ def open_run(
         UserError: the folder holds another run, or none to resume, or is in use, or cannot be written.
     """
     with contextlib.ExitStack() as stack:
-        try:
+        with _refusals_told(Path(path)):
             run = _open(stack, Path(path), config, resume, may_change, tensorboard)
-        except OSError as error:
-            raise UserError(f"cannot write to {path}: {error.strerror}") from error
         yield run
+
+
+def check_place(folder: Path, *, resume: bool) -> None:
+    """Refuses what `open_run` would refuse, as far as that shows before anything is made in or beside the folder.
+
+    Args:
+        folder: of the run.
+        resume: whether it is to hold a run, or none.
+
+    Raises:
+        UserError: it holds a run, or none to resume, or something else, or cannot be written.
+    """
+    check_writable(folder)
+    with _refusals_told(folder):
+        holds_run = (folder / "config.json").exists()
+        if resume and not holds_run:
+            raise UserError(f"there is no run to resume in {folder}")
+        if holds_run and not resume:
+            raise UserError(f"{folder} holds a run already: continue it with --resume, or choose another --out")
+        if not holds_run and folder.is_dir() and {entry.name for entry in folder.iterdir()} - _LEFT_BY_A_KILL:
+            raise UserError(f"{folder} is not empty and holds no run; choose another --out")
+
+
+def check_writable(folder: Path) -> None:
+    """Refuses a folder in which nothing can be made, or which cannot be made.
+
+    Raises:
+        UserError: it is below a file, or is one, or the system says no.
+    """
+    with _refusals_told(folder):
+        place = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.exists())
+        if not place.is_dir():
+            raise UserError(f"cannot write to {folder}: {place} is a file, not a folder")
+        if not os.access(place, os.W_OK | os.X_OK):
+            raise UserError(f"cannot write to {folder}: {place} is not writable")
+
+
+@contextlib.contextmanager
+def _refusals_told(folder: Path) -> Iterator[None]:
+    """What the system refuses, as one line."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"cannot write to {folder}: {error.strerror or error}") from error
 
 
 def _open(
@@ -181,22 +225,38 @@ def _open(
 ) -> RunFolder:
     """`open_run` up to the point where the caller takes over; what must be undone goes on the stack."""
     resolved = _plain(config)
-    _check_place(folder, resume)
-    folder.mkdir(parents=True, exist_ok=True)
-    _lock(stack.enter_context((folder / _LOCK).open("a")), folder)
-    _check_place(folder, resume)  # again under the lock: another process may have begun a run meanwhile
-    circumstances = _circumstances()
-    record = {"format": FORMAT, "config": resolved, "config_hash": config_hash(resolved), **circumstances}
-    if resume:
-        before = read_record(folder)
-        _check_same(folder, before["config"], resolved, may_change)
-        record["earlier"] = [*before.get("earlier", []), {name: before.get(name) for name in circumstances}]
-    _write_atomically(folder / "config.json", json.dumps(record, indent=2) + "\n")
-    run = RunFolder(folder, resolved, record["config_hash"], resume, tensorboard)
-    stack.callback(run._close_events)
-    if not resume:
-        run._begin(-1)
+    check_place(folder, resume=resume)
+    with contextlib.ExitStack() as undo:
+        undo.callback(_remove_empty, [place for place in (folder, *folder.parents) if not place.exists()])
+        folder.mkdir(parents=True, exist_ok=True)
+        _lock(stack.enter_context((folder / _LOCK).open("a")), folder)
+        check_place(folder, resume=resume)  # again under the lock: another process may have begun a run meanwhile
+        if not resume:
+            undo.callback(_remove_beginnings, folder)
+        circumstances = _circumstances()
+        record = {"format": FORMAT, "config": resolved, "config_hash": config_hash(resolved), **circumstances}
+        if resume:
+            before = read_record(folder)
+            _check_same(folder, before["config"], resolved, may_change)
+            record["earlier"] = [*before.get("earlier", []), {name: before.get(name) for name in circumstances}]
+        _write_atomically(folder / "config.json", json.dumps(record, indent=2) + "\n")
+        run = RunFolder(folder, resolved, record["config_hash"], resume, tensorboard)
+        stack.callback(run._close_events)
+        if not resume:
+            run._begin(-1)
+        undo.pop_all()
     return run
+
+
+def _remove_beginnings(folder: Path) -> None:
+    for path in (folder / name for name in _BEGUN):
+        shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+
+
+def _remove_empty(folders: Sequence[Path]) -> None:
+    for folder in folders:
+        with contextlib.suppress(OSError):  # it is not empty, or was never made
+            folder.rmdir()
 
 
 def read_record(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -249,19 +309,6 @@ def read_summary(path: str | os.PathLike[str]) -> dict[str, Any] | None:
 def config_hash(config: Mapping[str, Any]) -> str:
     """SHA-256 of a configuration, the same for every order of its entries."""
     return hashlib.sha256(json.dumps(_plain(config), sort_keys=True).encode()).hexdigest()
-
-
-def _check_place(folder: Path, resume: bool) -> None:
-    """Refuses what can be refused before anything is made in or beside the folder."""
-    if folder.exists() and not folder.is_dir():
-        raise UserError(f"{folder} is a file; a run needs a folder")
-    holds_run = (folder / "config.json").exists()
-    if resume and not holds_run:
-        raise UserError(f"there is no run to resume in {folder}")
-    if holds_run and not resume:
-        raise UserError(f"{folder} holds a run already: continue it with --resume, or choose another --out")
-    if not holds_run and folder.is_dir() and {entry.name for entry in folder.iterdir()} - _LEFT_BY_A_KILL:
-        raise UserError(f"{folder} is not empty and holds no run; choose another --out")
 
 
 def _check_same(folder: Path, there: Any, here: Any, may_change: Sequence[str]) -> None:
@@ -368,8 +415,12 @@ def _commit() -> str | None:
 def _write_atomically(file: Path, text: str) -> None:
     """Replaces a file so that no reader and no kill ever meets half of it."""
     temporary = file.with_name(f".{file.name}.new")
-    with temporary.open("w", encoding="utf-8") as stream:
-        stream.write(text)
-        stream.flush()
-        os.fsync(stream.fileno())
-    temporary.replace(file)
+    try:
+        with temporary.open("w", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.replace(file)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise

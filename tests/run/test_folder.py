@@ -180,12 +180,14 @@ def test_places_that_are_refused_stay_as_they_are(tmp_path: Path) -> None:
     (tmp_path / "full" / "thesis.tex").write_text("x")
     before = contents(tmp_path)
     for name, resume, message in [
-        ("file", False, "is a file"),
-        ("file/below", False, "cannot write to .*: Not a directory"),
+        ("file", False, "cannot write to .*file: .*file is a file, not a folder"),
+        ("file/below", False, "cannot write to .*below: .*file is a file, not a folder"),
         ("full", False, "is not empty and holds no run"),
         ("full", True, "no run to resume"),
         ("missing", True, "no run to resume"),
         ("n" * 300, False, "cannot write to .*: File name too long"),
+        ("new/" + "n" * 300, False, "cannot write to .*: File name too long"),
+        ("new/" + "n" * 250 + "/n" * 2000, False, "cannot write to .*: File name too long"),
     ]:
         with pytest.raises(UserError, match=message), open_run(tmp_path / name, Config(), resume=resume):
             pass
@@ -200,6 +202,30 @@ def test_a_folder_without_permission_is_refused(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(Path, "mkdir", refuse)  # modes do not bind a superuser
     with pytest.raises(UserError, match=r"run: Permission denied"), open_run(tmp_path / "run", Config()):
         pass
+
+
+@pytest.mark.parametrize("there", [False, True])
+@pytest.mark.parametrize("failing", ["config.json", "events"])
+def test_what_cannot_begin_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, there: bool, failing: str
+) -> None:
+    """Such as on a disk that is full."""
+
+    def full(*args: object, **kwargs: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    folder = tmp_path / "a" / "b"
+    if there:
+        folder.mkdir(parents=True)
+    before = contents(tmp_path)
+    if failing == "config.json":
+        monkeypatch.setattr(os, "fsync", full)
+    else:
+        monkeypatch.setattr("tensorboardX.SummaryWriter", full)
+    with pytest.raises(UserError, match=r"cannot write to .*b: No space left on device"), open_run(folder, Config()):
+        pass
+    assert contents(tmp_path) == before
+    assert folder.exists() == (tmp_path / "a").exists() == there
 
 
 def test_an_error_inside_is_not_dressed_up(tmp_path: Path) -> None:
