@@ -7,6 +7,7 @@ import dataclasses
 import io
 import re
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import tyro
@@ -16,6 +17,7 @@ from hrlspec.run.errors import UserError
 
 Flags = TypeVar("Flags")
 
+_ELSEWHERE = re.compile(r"(gs|s3):|[A-Za-z][\w+.-]+:/")  # pathlib makes one slash of two
 _SETTING = re.compile(r"(?:Error parsing (\S+): )?([A-Z]\w*)\.([\w.]+)(?= is )")
 
 
@@ -46,6 +48,10 @@ def parse_flags(
         if not stop.code:
             raise
         raise UserError(f"{in_flags(_reason(said.getvalue()), default)} (see {program} --help)") from None
+    for name, value in vars(parsed).items():
+        if isinstance(value, Path) and _ELSEWHERE.match(str(value)):
+            flag = f"--{name.replace('_', '-')}"
+            raise UserError(f"{flag} is {value}, expected a path on this machine; storage elsewhere has to be mounted")
     return parsed
 
 

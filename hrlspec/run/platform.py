@@ -11,10 +11,15 @@ import ctypes
 import functools
 import importlib.metadata
 import os
+import re
+import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import jax
+
+from hrlspec.run.errors import UserError
 
 _OPTIONS = "--xla_backend_extra_options="
 # The CPU backend folds the body of a small loop into one kernel, which makes rollouts several times faster. Up to JAX
@@ -32,13 +37,46 @@ def prepare() -> None:
     """Sets XLA's flags for this version of JAX and a compilation cache that later processes share.
 
     What the user set in ``XLA_FLAGS``, ``JAX_COMPILATION_CACHE_DIR`` and JAX's other variables stays as it is.
+
+    Raises:
+        UserError: XLA would end the process because of its flags.
     """
     _keep_freed_memory()
-    os.environ["XLA_FLAGS"] = with_loop_option(os.environ.get("XLA_FLAGS", ""), jax.__version_info__)
-    if jax.config.values["jax_compilation_cache_dir"] is None:
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
+    flags = _flags_of_user(os.environ.get("XLA_FLAGS", ""))
+    os.environ["XLA_FLAGS"] = with_loop_option(flags, jax.__version_info__)
+    folder = cache_folder()
+    if jax.config.values["jax_compilation_cache_dir"] is None and folder is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    # A cache that cannot be read or written costs time and nothing else.
+    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
+
+
+@functools.cache
+def _flags_of_user(given: str) -> str:
+    """The flags in ``XLA_FLAGS``, or in the file that it names, once XLA has accepted them.
+
+    XLA ends its process where it does not, so one of its own is asked.
+    """
+    if not given.strip():
+        return ""
+    flags = given
+    if not given[0].isspace() and given[0] != "-":  # so XLA decides
+        try:
+            flags = Path(given).read_text()
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise UserError(f"XLA_FLAGS names the file {given!r}, which cannot be read: {reason}") from error
+    ask = "from jaxlib import xla_client; xla_client.CompileOptions()"
+    asked = subprocess.run(
+        [sys.executable, "-c", ask], env=os.environ | {"XLA_FLAGS": flags}, capture_output=True, check=False
+    )
+    answer = asked.stderr.decode(errors="replace")
+    if asked.returncode and "Traceback" not in answer:  # it was XLA and not Python that ended the process
+        said = re.search(r"Unknown flags? in XLA_FLAGS: (.*)", answer)
+        raise UserError(f"XLA does not know {said[1]}" if said else f"XLA does not accept XLA_FLAGS: {given}")
+    return flags
 
 
 def _keep_freed_memory() -> None:
@@ -90,7 +128,10 @@ def _is_known(name: str, value: str | bool) -> bool:
     return True
 
 
-def cache_folder() -> Path:
-    """The user's folder for compiled programs, one for each version of jaxlib."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+def cache_folder() -> Path | None:
+    """The user's folder for compiled programs, one for each version of jaxlib; ``None`` for users without a home."""
+    try:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError:
+        return None
     return Path(base) / "hrlspec" / f"jaxlib-{importlib.metadata.version('jaxlib')}"

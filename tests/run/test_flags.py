@@ -23,6 +23,7 @@ class Flags(Checked):
     """What to do."""
 
     how_often: int = setting(1, least=1)
+    put_it: Path = Path("here")
     optimiser: OptimiserConfig = dataclasses.field(default_factory=OptimiserConfig)
 
 
@@ -39,6 +40,18 @@ def test_what_is_wrong(argv: str, message: str) -> None:
     with pytest.raises(UserError) as error:
         parse_flags(Flags, argv.split(), program="it")
     assert str(error.value) == message
+
+
+@pytest.mark.parametrize("place", ["gs://bucket/runs", "s3:", "s3:bucket", "hdfs://host/runs", "https://host/x"])
+def test_places_elsewhere_are_refused_by_name(place: str) -> None:
+    with pytest.raises(UserError) as error:
+        parse_flags(Flags, ["--put-it", place], program="it")
+    assert str(error.value).startswith(f"--put-it is {Path(place)}, expected a path on this machine; ")
+
+
+@pytest.mark.parametrize("place", ["/gs:/x", "lr:0.1/x", "a:b", "gs", "C:/x", ":", "runs/gs://x"])
+def test_names_with_colons_are_paths(place: str) -> None:
+    assert parse_flags(Flags, ["--put-it", place], program="it").put_it == Path(place)
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "utf-8"])

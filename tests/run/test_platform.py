@@ -11,6 +11,7 @@ import jax
 import pytest
 
 from hrlspec.run import platform
+from hrlspec.run.errors import UserError
 from hrlspec.run.platform import compiler_options, with_loop_option
 
 ROOT = Path(__file__).parents[2]
@@ -56,6 +57,41 @@ def test_what_gains_from_it_is_optimised_in_full(monkeypatch: pytest.MonkeyPatch
     assert compiler_options(quick=False) == {}
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert compiler_options(quick=True) == {}
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("--xla_no_such_flag=1", "XLA does not know --xla_no_such_flag=1"),
+        ("--xla_backend_optimization_level=high", "XLA does not accept XLA_FLAGS: --xla_backend_optimization_level"),
+        ("nowhere.txt", "XLA_FLAGS names the file 'nowhere.txt', which cannot be read: No such file or directory"),
+        ("flags.txt", "XLA does not know --xla_from_file=1"),
+    ],
+)
+def test_flags_at_which_xla_ends_the_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: str, message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("flags.txt").write_text("--xla_from_file=1")
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    with pytest.raises(UserError, match=message):
+        platform.prepare()
+    assert os.environ["XLA_FLAGS"] == flags
+
+
+def test_flags_in_a_file_are_taken_from_there(tmp_path: Path) -> None:
+    file = tmp_path / "flags.txt"
+    file.write_text("--xla_cpu_use_fusion_emitters=true\n")
+    assert platform._flags_of_user(str(file)) == "--xla_cpu_use_fusion_emitters=true\n"
+
+
+def test_users_without_a_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nowhere() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", nowhere)
+    assert platform.cache_folder() is None
 
 
 SCRIPT = """
