@@ -86,6 +86,22 @@ def test_training_is_the_loop_that_anybody_can_write() -> None:
     assert [some for _, some in history] == metrics
 
 
+@pytest.mark.slow
+def test_training_can_be_vmapped_and_scanned_by_other_code() -> None:
+    trainer, machine = Trainer(Agent(ENV, CONFIG, METHOD)), reward_machine(ENV.propositions)
+    reserved = jnp.asarray(np.unique(HELD_OUT.hashes))
+    bank = TaskBanks(0, CONFIG.curriculum, ENV.num_propositions, np.unique(HELD_OUT.hashes)).at(0)
+
+    def trained(key: jax.Array) -> Any:
+        begun = trainer.init(key, bank, machine)
+        return jax.lax.scan(lambda state, _: trainer.iterate(state, bank, machine, reserved), begun, length=3)
+
+    keys = jax.random.split(jax.random.key(0), 2)
+    state, metrics = jax.eval_shape(jax.vmap(trained), keys)
+    assert state.iteration.shape == (2,)
+    assert metrics["returns"].shape == (2, 3)
+
+
 def test_progress_is_told_after_each_iteration() -> None:
     for history, shape in ((alone(SEEDS[0])[1], ()), (together()[1], (len(SEEDS),))):
         assert [steps for steps, _ in history] == [STEPS_PER_ITERATION * (i + 1) for i in range(ITERATIONS)]

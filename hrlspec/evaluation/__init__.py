@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from hrlspec.evaluation.aggregate import Aggregate, aggregate
 from hrlspec.evaluation.cases import BranchCases, Cases, make_branch_cases, make_cases
+from hrlspec.evaluation.episodes import Episodes, run_episodes
 from hrlspec.evaluation.protocol import (
     ChoiceEvaluation,
     ReturnEvaluation,
@@ -23,6 +24,7 @@ __all__ = [
     "Cases",
     "ChoiceEvaluation",
     "ChoiceResult",
+    "Episodes",
     "ReturnEvaluation",
     "ReturnResult",
     "Score",
@@ -38,6 +40,7 @@ __all__ = [
     "make_cases",
     "periodic_evaluation",
     "return_evaluation",
+    "run_episodes",
     "suite_from_text",
     "suite_from_trees",
 ]

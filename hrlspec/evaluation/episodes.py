@@ -27,7 +27,7 @@ from hrlspec.tasks.rewards import RewardMachine
 
 @struct.dataclass
 class Episodes:
-    """Outcomes of B episodes: JAX arrays in jitted code, numpy arrays outside.
+    """Outcomes of B episodes.
 
     Attributes:
         success: bool ``[B]``, the task was satisfied within the horizon.
@@ -71,7 +71,7 @@ def run_episodes(
     shield: bool = False,
     chunk: int = 500,
 ) -> Episodes:
-    """One episode per task and layout.
+    """One episode per task and layout: a pure function, to be jitted (``agent`` static), vmapped and scanned.
 
     Args:
         key: consumed.
@@ -85,7 +85,7 @@ def run_episodes(
         chunk: episodes run in parallel; bounds memory. Each size compiles once.
 
     Returns:
-        numpy arrays, leading axis B.
+        JAX arrays, leading axis B.
     """
     chex.assert_equal_shape_prefix(jax.tree.leaves((trees, layouts)), 1)
     total = trees.parent.shape[0]
@@ -94,10 +94,10 @@ def run_episodes(
     for first in range(0, total, chunk):
         # The last chunk is filled up by wrapping around, so that every chunk has one compiled shape.
         rows = np.arange(first, first + chunk) % total
-        some = jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], (trees, layouts))
+        some = jax.tree.map(lambda x, rows=rows: x[rows], (trees, layouts))
         episodes, _ = _run(jax.random.fold_in(key, first), agent, params, machine, *some, greedy, shield, False)
-        parts.append(jax.tree.map(lambda x, n=total - first: np.asarray(x)[:n], episodes))
-    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+        parts.append(jax.tree.map(lambda x, n=total - first: x[:n], episodes))
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
 
 def trace_episodes(
@@ -112,7 +112,9 @@ def trace_episodes(
     shield: bool = False,
 ) -> tuple[Episodes, Trace]:
     """As :func:`run_episodes`, for a few episodes, with their trajectories."""
-    return jax.tree.map(np.asarray, _run(key, agent, params, machine, trees, layouts, greedy, shield, True))
+    episodes, trace = _run(key, agent, params, machine, trees, layouts, greedy, shield, True)
+    assert trace is not None
+    return episodes, trace
 
 
 @functools.partial(jax.jit, static_argnames=("agent", "greedy", "shield", "traced"))

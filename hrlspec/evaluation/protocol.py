@@ -54,7 +54,7 @@ class SuiteEvaluation:
         episodes = run_episodes(
             key, agent, params, machine, cases.trees, cases.layouts, chunk=_even(len(cases), self.chunk), **how
         )
-        return score_suite(cases, episodes, machine, horizon=agent.env.horizon, **how)
+        return score_suite(cases, jax.device_get(episodes), machine, horizon=agent.env.horizon, **how)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +84,7 @@ class ReturnEvaluation:
             greedy=self.greedy,
             chunk=_even(len(cases), self.chunk),
         )
-        return score_returns(cases, episodes, machine, greedy=self.greedy)
+        return score_returns(cases, jax.device_get(episodes), machine, greedy=self.greedy)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +102,8 @@ class ChoiceEvaluation:
     def __call__(self, key: Key[Array, ""], agent: Agent, params: Params, machine: RewardMachine) -> ChoiceResult:
         """Scores an agent. The key is consumed."""
         suite = self.suite
-        episodes, trace = trace_episodes(key, agent, params, machine, suite.tasks, suite.layouts, greedy=self.greedy)
+        traced = trace_episodes(key, agent, params, machine, suite.tasks, suite.layouts, greedy=self.greedy)
+        episodes, trace = jax.device_get(traced)
         # Entry t of a trace is the state before step t, so the first one away from the root is where the edge led.
         away = trace.running & (trace.node != TaskTree.ROOT)
         there = jax.tree.map(lambda x: x[away.argmax(0), np.arange(x.shape[1])], trace.env_state)

@@ -146,7 +146,7 @@ def examples(
 def episodes_of(key: jax.Array, agent: Agent, params: Params, machine: RewardMachine, suite: Suite) -> list[Episode]:
     """One episode of each task of a suite, each in a layout of its own, actions sampled."""
     layouts = draw_layouts(agent.env, suite, 1)
-    ended, trace = trace_episodes(key, agent, params, machine, suite.trees, layouts)
+    ended, trace = jax.device_get(trace_episodes(key, agent, params, machine, suite.trees, layouts))
     found = []
     for i, formula in enumerate(suite.formulas):
         tree, layout, end = jax.tree.map(lambda x, i=i: x[i], (suite.trees, layouts, ended))

@@ -6,6 +6,7 @@ import functools
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -25,6 +26,7 @@ from hrlspec.evaluation import (
     make_cases,
     periodic_evaluation,
     return_evaluation,
+    run_episodes,
     suite_from_text,
     suite_from_trees,
 )
@@ -64,6 +66,22 @@ def _parameters(agent: Agent, seed: int) -> Params:
 @functools.cache
 def _cases():
     return make_cases(LETTER, _sequences(4, 12, 2), layouts_per_task=10)
+
+
+def test_episodes_can_be_jitted_and_vmapped():
+    """Over parameters, in chunks of which the last is not full; each as alone."""
+    cases = _cases()
+    some = jax.tree.map(lambda x: x[:7], (cases.trees, cases.layouts))
+
+    def run(params):
+        return run_episodes(KEY, WALKER, params, COMPLETION, *some, greedy=True, chunk=3)
+
+    both = jax.jit(jax.vmap(run))(jax.tree.map(lambda *x: jnp.stack(x), NEAREST, AHEAD))
+    for i, alone in enumerate((run(NEAREST), run(AHEAD))):
+        for name in ("success", "violated", "steps", "returns"):
+            np.testing.assert_array_equal(getattr(both, name)[i], getattr(alone, name), err_msg=name)
+    assert both.steps.shape == (2, 7)
+    assert both.steps[1].sum() < both.steps[0].sum()
 
 
 def test_the_agent_that_goes_to_the_nearest_goal_scores_what_the_reference_agent_does():

@@ -154,7 +154,7 @@ def act(demo: Demo, trained: tuple[Agent, Params], seed: int) -> Shown:
     keys = jax.random.split(jax.random.key(seed + 1), LAYOUTS)
     layouts = jax.vmap(demo.env.sample_layout, (0, None))(keys, demo.env.default_params)
     key = jax.random.key(seed + 2)
-    episodes, trace = trace_episodes(key, agent, params, demo.machine, trees, layouts, greedy=True)
+    episodes, trace = jax.device_get(trace_episodes(key, agent, params, demo.machine, trees, layouts, greedy=True))
     return Shown(tree, jax.tree.map(np.asarray, layouts), episodes, trace)
 
 
