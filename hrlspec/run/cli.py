@@ -1,4 +1,7 @@
-"""The console command ``hrlspec``: one sub-command for each module of ``experiments/``."""
+"""The console command ``hrlspec``: one sub-command for each module of ``experiments/``.
+
+Libraries that take seconds to load are imported when a command needs them: signals are heard before, and help is quick.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,6 @@ from collections.abc import Callable, Sequence
 
 from hrlspec.run.checkout import check_checkout
 from hrlspec.run.errors import UserError, main_guard
-from hrlspec.run.lookup import search_here
 from hrlspec.version import __version__
 
 COMMANDS = {
@@ -29,14 +31,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     name, *rest = (sys.argv[1:] if argv is None else argv) or [""]
     if name in ("-h", "--help"):
-        print("usage: hrlspec COMMAND [OPTIONS]\n")
-        print("Zero-shot reinforcement learning from logical specifications.\n\ncommands:")
-        print("\n".join(f"  {command:<10} {about}" for command, about in COMMANDS.items()))
-        print("\nhrlspec COMMAND --help shows the options; hrlspec --version the version.")
-        return 0
+        return main_guard(lambda: print(_help()))
     if name == "--version":
-        print(f"hrlspec {__version__}")
-        return 0
+        return main_guard(lambda: print(f"hrlspec {__version__}"))
     return call(name, rest, program=f"hrlspec {name}")
 
 
@@ -51,6 +48,17 @@ def call(name: str, argv: Sequence[str] | None = None, *, program: str) -> int:
     return main_guard(lambda: _command(name)(sys.argv[1:] if argv is None else argv, program=program))
 
 
+def _help() -> str:
+    return "\n".join(
+        [
+            "usage: hrlspec COMMAND [OPTIONS]",
+            "\nZero-shot reinforcement learning from logical specifications.\n\ncommands:",
+            *(f"  {command:<10} {about}" for command, about in COMMANDS.items()),
+            "\nhrlspec COMMAND --help shows the options; hrlspec --version the version.",
+        ]
+    )
+
+
 def _command(name: str) -> Callable[..., None]:
     """The command's main function.
 
@@ -61,6 +69,8 @@ def _command(name: str) -> Callable[..., None]:
         raise UserError(f"expected a command, one of {', '.join(COMMANDS)}, found {name!r} (see hrlspec --help)")
     if name in _IN_CHECKOUT:
         check_checkout(name)
+        from hrlspec.run.lookup import search_here
+
         search_here()
     package = "experiments" if name in _IN_CHECKOUT else "hrlspec.run.commands"
     try:

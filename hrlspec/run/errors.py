@@ -1,23 +1,20 @@
 """What a command line says and returns when it cannot go on.
 
-Exit status 0: done; 2: bad usage or input, with one clear line on standard error and no traceback; 130: interrupted.
-Anything else is a bug and shows its traceback.
+Exit status 0: done; 1: failed, as training that diverged, or results that could not be printed; 2: bad usage or input;
+130: interrupted. Each but the first comes with one clear line on standard error. Anything else is a bug and shows its
+traceback.
 """
 
 from __future__ import annotations
 
-import os
-import signal
+import errno
 import sys
-import threading
 from collections.abc import Callable
-from types import FrameType
 
-from hrlspec.checkpoint import CheckpointError
-from hrlspec.presets.suites import SuiteError
-from hrlspec.spec import SpecError
+from hrlspec.run.signals import INTERRUPTED, ended_by_signals
+from hrlspec.run.streams import lasting_streams
 
-OK, BAD_INPUT, INTERRUPTED = 0, 2, 130
+OK, FAILED, BAD_INPUT = 0, 1, 2
 
 
 class UserError(Exception):
@@ -31,35 +28,36 @@ class Interrupted(Exception):
 def main_guard(main: Callable[[], None]) -> int:
     """Runs a command line and returns its exit status: ``sys.exit(main_guard(main))``.
 
-    `UserError`, `SpecError`, `SuiteError` and `CheckpointError` become one line on standard error and status 2.
-    `Interrupted`, Ctrl-C and SIGTERM become status 130. ``SystemExit``, which the parser of flags raises, passes
-    through.
+    `UserError`, `SpecError`, `SuiteError` and `CheckpointError` become one line on standard error and status 2;
+    `Interrupted` becomes one and status 130. Where the work does not stop in order, Ctrl-C and SIGTERM end the process
+    with status 130. ``SystemExit``, which the parser of flags raises, passes through.
+
+    Nothing that cannot be written stops the work. If it was a result it is said at the end, with status 1; a reader
+    who left, as in ``... | head``, has what it wants.
     """
-    # Without this SIGTERM would end the process on the spot: no lock released in order, no status of its own.
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    before = signal.signal(signal.SIGTERM, _interrupt) if in_main_thread else None
-    try:
-        main()
-        sys.stdout.flush()
-    except (UserError, SpecError, SuiteError, CheckpointError) as error:
-        return _say(f"error: {error}", BAD_INPUT)
-    except Interrupted as stop:
-        return _say(f"interrupted: {stop}", INTERRUPTED)
-    except KeyboardInterrupt:
-        return _say("interrupted", INTERRUPTED)
-    except BrokenPipeError:
-        # The reader has left, as in `... | head`. What is still buffered must not raise again at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return OK
-    finally:
-        if before is not None:
-            signal.signal(signal.SIGTERM, before)
+    with lasting_streams() as out, ended_by_signals():
+        try:
+            main()
+        except Interrupted as stop:
+            return _say(f"interrupted: {stop}", INTERRUPTED)
+        except Exception as error:
+            if not isinstance(error, _expected()):
+                raise
+            return _say(f"error: {error}", BAD_INPUT)
+        finally:
+            out.flush()
+        if out.lost is not None and out.lost.errno != errno.EPIPE:
+            return _say(f"error: cannot write to standard output: {out.lost.strerror}", FAILED)
     return OK
 
 
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    del number, frame
-    raise KeyboardInterrupt
+def _expected() -> tuple[type[Exception], ...]:
+    """What the user can mend. Imported when needed: these modules take seconds, and signals come meanwhile."""
+    from hrlspec.checkpoint import CheckpointError
+    from hrlspec.presets.suites import SuiteError
+    from hrlspec.spec import SpecError
+
+    return UserError, SpecError, SuiteError, CheckpointError
 
 
 def _say(line: str, status: int) -> int:

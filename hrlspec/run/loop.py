@@ -126,7 +126,7 @@ class Loop:
         except checkpoint.CheckpointMissingError:
             self._folder.rewind(-1)
             return state
-        if restored.metadata["config_hash"] != self._folder.config_hash:
+        if restored.metadata["config_hash"] not in {self._folder.config_hash, *self._folder.earlier_hashes}:
             raise checkpoint.CheckpointMismatchError(f"checkpoint {restored.path} belongs to another run")
         self._at = Position(**restored.metadata["position"])
         self._folder.rewind(restored.step)
@@ -136,10 +136,11 @@ class Loop:
         """Iterates to the end, from where `restore` left off.
 
         Raises:
-            Interrupted: SIGINT or SIGTERM came; a checkpoint was written.
+            Interrupted: SIGINT or SIGTERM came after the first iteration; a checkpoint was written.
             DivergedError: updates were skipped for too long, or parameters are not finite.
         """
-        with polled_signals() as stop:
+        with polled_signals(f"--resume continues from what is in {self._folder.path}") as stop:
+            stop.patient = False  # while the first iteration compiles, nothing has been done
             return self._train(state, stop)
 
     def _train(self, state: State, stop: StopRequest) -> State:
@@ -149,6 +150,7 @@ class Loop:
         first = at.done
         while at.done < job.num_iterations:
             state, metrics = job.iterate(state, at.done)
+            stop.patient = True
             at.done += 1
             self._pending.append(metrics)
             if at.done == first + 1:

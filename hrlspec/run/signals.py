@@ -1,18 +1,24 @@
-"""Turns Ctrl-C and SIGTERM into a flag that is polled where stopping is safe.
+"""Ctrl-C and SIGTERM: the end at once, or a flag that is polled where stopping is safe.
 
-Inside a jitted chunk nothing can be stopped, and between two writes nothing should be: the loop asks between
-iterations, saves, and leaves. A second signal does not wait.
+Python runs a handler in the main thread, between two of its instructions: while a compiler works it would wait for it,
+and what it raises comes up anywhere, in the midst of an import or of a library's callback. So a thread of its own hears
+of signals. It sets the flag, or ends the process without unwinding anything; files are written so that they are whole
+however a process ends.
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
+import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
 
+INTERRUPTED = 130
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_PATIENCE = 1.0  # seconds
 
 
 class StopRequest:
@@ -20,21 +26,37 @@ class StopRequest:
 
     Attributes:
         signal_name: ``SIGINT`` or ``SIGTERM`` once asked, else ``None``.
+        patient: whether the first signal waits to be polled; while there is nothing to save, it need not.
     """
 
     def __init__(self) -> None:
         self.signal_name: str | None = None
+        self.patient = True
 
     def __bool__(self) -> bool:
         return self.signal_name is not None
 
 
 @contextlib.contextmanager
-def polled_signals() -> Iterator[StopRequest]:
-    """While the context lasts the first SIGINT or SIGTERM sets the flag; the second raises ``KeyboardInterrupt``.
+def ended_by_signals(how_to_go_on: str = "") -> Iterator[None]:
+    """While the context lasts SIGINT and SIGTERM end the process, with one line and status 130.
+
+    Args:
+        how_to_go_on: said in the line.
+    """
+    with _heard(lambda name: _end(how_to_go_on)):
+        yield
+
+
+@contextlib.contextmanager
+def polled_signals(how_to_go_on: str = "") -> Iterator[StopRequest]:
+    """While the context lasts the first SIGINT or SIGTERM sets the flag; the second ends the process.
 
     The handlers that were there before come back afterwards. Signals reach the main thread alone, so in any other
     thread nothing is installed and the flag stays unset.
+
+    Args:
+        how_to_go_on: said in the line with which the process ends.
 
     Example:
         >>> with polled_signals() as stop:
@@ -42,19 +64,54 @@ def polled_signals() -> Iterator[StopRequest]:
         ...         break  # one iteration
     """
     stop = StopRequest()
+
+    def hear(name: str) -> None:
+        if stop or not stop.patient:
+            _end(how_to_go_on)
+        stop.signal_name = name
+
+    with _heard(hear):
+        yield stop
+
+
+@contextlib.contextmanager
+def _heard(hear: Callable[[str], None]) -> Iterator[None]:
+    """Calls a function with the name of each signal, in a thread; the main thread goes on when it has returned."""
     if threading.current_thread() is not threading.main_thread():
-        yield stop
+        yield
         return
+    ours, theirs = socket.socketpair()
+    theirs.setblocking(False)  # as the interpreter wants it, which writes the number of each signal at once
+    heard = threading.Semaphore(0)
 
-    def note(number: int, frame: FrameType | None) -> None:
-        del frame
-        if stop:
-            raise KeyboardInterrupt
-        stop.signal_name = signal.Signals(number).name
+    def listen() -> None:
+        while number := ours.recv(1):
+            if number[0] in SIGNALS:
+                hear(signal.Signals(number[0]).name)
+                heard.release()
 
-    before = {number: signal.signal(number, note) for number in SIGNALS}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    def wait(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        heard.acquire(timeout=_PATIENCE)
+
+    listener = threading.Thread(target=listen, name="signals", daemon=True)
+    with ours, theirs:
+        listener.start()
+        woken = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
+        before = {number: signal.signal(number, wait) for number in SIGNALS}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+            signal.set_wakeup_fd(woken)
+            theirs.shutdown(socket.SHUT_WR)
+            listener.join()
+
+
+def _end(how_to_go_on: str) -> None:
+    """Ends the process: one line, past the streams, which the main thread may hold."""
+    line = f"interrupted: {how_to_go_on}" if how_to_go_on else "interrupted"
+    with contextlib.suppress(OSError):
+        os.write(2, f"{line}\n".encode(errors="replace"))
+    os._exit(INTERRUPTED)

@@ -15,13 +15,23 @@ from rich.console import Console
 
 from hrlspec.evaluation import SuiteResult, aggregate
 from hrlspec.run import platform
-from hrlspec.run.errors import Interrupted, UserError
+from hrlspec.run.errors import UserError
 from hrlspec.run.experiment import Experiment, experiment_of
-from hrlspec.run.folder import RunFolder, open_run, read_metrics, read_record, read_summary
+from hrlspec.run.folder import (
+    RunFolder,
+    check_place,
+    check_same,
+    holds_run,
+    open_run,
+    read_metrics,
+    read_record,
+    read_summary,
+)
 from hrlspec.run.learner import Learner
 from hrlspec.run.loop import DivergedError, Loop
 from hrlspec.run.progress import ProgressDisplay, duration
-from hrlspec.run.run_flags import RunFlags, experiments_of, parse_run
+from hrlspec.run.run_flags import RunFlags, experiments_of, parse_run, schedules_moved
+from hrlspec.run.signals import ended_by_signals
 from hrlspec.run.tables import aggregate_table, final_tables, result_console
 from hrlspec.run.unseen import with_tasks
 
@@ -55,30 +65,51 @@ def main(argv: Sequence[str], *, program: str = "hrlspec run") -> None:
 
 def _check_folders(runs: Sequence[tuple[Experiment, Path]], flags: RunFlags) -> list[bool]:
     """For each run whether to resume it; refuses before the first begins what would fail at a later one."""
-    begun = [(folder / "config.json").exists() for _, folder in runs]
-    if not flags.resume:
-        for (_, folder), exists in zip(runs, begun, strict=True):
-            if exists:
-                raise UserError(f"{folder} holds a run already: continue it with --resume, or choose another --out")
-        return begun
-    if not any(begun):
+    begun = [flags.resume and holds_run(folder) for _, folder in runs]
+    if flags.resume and not any(begun):
         raise UserError(f"there is no run to resume in {runs[0][1]}")
-    for (experiment, folder), exists in zip(runs, begun, strict=True):
-        record = read_record(folder) if exists else {}
-        if exists and read_summary(folder) is not None and experiment_of(record["config"], str(folder)) != experiment:
-            raise UserError(f"{folder} holds a finished run with other settings; choose another --out")
+    for (experiment, folder), resume in zip(runs, begun, strict=True):
+        if resume:
+            _check_resumable(experiment, folder, flags)
+        else:
+            check_place(folder, resume=False)
     return begun
+
+
+def _check_resumable(experiment: Experiment, folder: Path, flags: RunFlags) -> None:
+    """Refuses to continue another run, or this one with fewer steps than it was to have."""
+    record = read_record(folder)
+    before = experiment_of(record["config"], str(folder))
+    check_same(folder, record["config"], experiment, _may_change(flags))
+    if experiment.config.total_steps < before.config.total_steps:
+        raise UserError(f"{folder} was begun with --total-steps {before.config.total_steps}: give more, or the same")
+    if _results(experiment, folder) is None:
+        check_place(folder, resume=True)
+
+
+def _may_change(flags: RunFlags) -> tuple[str, ...]:
+    """In what a resumed run may differ: its length, if it is given and not the preset's."""
+    return () if flags.total_steps is None else ("config.total_steps",)
+
+
+def _results(experiment: Experiment, folder: Path) -> dict[str, Any] | None:
+    """The summary of a run that is finished, unless it is to become longer."""
+    summary = read_summary(folder)
+    config = experiment.config
+    over = summary is not None and summary.get("env_steps", 0) >= config.num_iterations * config.steps_per_iteration
+    return summary if over else None
 
 
 def _run(experiment: Experiment, folder: Path, resume: bool, flags: RunFlags, console: Console) -> dict[str, Any]:
     """One run from its beginning, or from where it was left, to its summary."""
-    summary = read_summary(folder) if resume else None
+    summary = _results(experiment, folder) if resume else None
     if summary is not None:
         console.print(f"{folder} is finished; its results are in summary.json", highlight=False, soft_wrap=True)
         return summary
+    before = experiment_of(read_record(folder)["config"], str(folder)) if resume else experiment
     preset = with_tasks(experiment.preset, folder, experiment.seed)
     learner = Learner(experiment, preset)
-    with open_run(folder, experiment, resume=resume) as run:
+    with open_run(folder, experiment, resume=resume, may_change=_may_change(flags)) as run:
         for name, text in preset.texts.items():
             run.write_tasks(name, text)
         job = learner.job()
@@ -86,19 +117,31 @@ def _run(experiment: Experiment, folder: Path, resume: bool, flags: RunFlags, co
         with ProgressDisplay(total, experiment.name) as display:
             loop = Loop(job, run, display, checkpoint_seconds=60 * flags.checkpoint_minutes)
             state = loop.restore()
-            begin = loop.position.done * job.steps_per_iteration
-            if begin:
-                display.note(f"continuing after {begin:,} steps")
+            if loop.position.done:
+                display.note(_continuing(experiment, before, loop.position.done))
             try:
                 state = loop.train(state)
             except DivergedError as error:
                 raise SystemExit(f"error: {error}") from None
         wall = loop.position.wall
         console.print(f"{experiment.name}: trained in {duration(wall)}; evaluating", highlight=False, soft_wrap=True)
-        try:
+        with ended_by_signals(f"during the final evaluation; training is saved in {folder}, --resume ends it"):
             return _finish(learner, run, state.params, total, wall, console)
-        except KeyboardInterrupt:
-            raise Interrupted(f"during the final evaluation; training is saved in {folder}, --resume ends it") from None
+
+
+def _continuing(experiment: Experiment, before: Experiment, done: int) -> str:
+    """What is said of a run that goes on."""
+    said = f"continuing after {done * experiment.config.steps_per_iteration:,} steps"
+    iterations = before.config.num_iterations
+    if experiment.config.num_iterations == iterations:
+        return said
+    said += f", now to {experiment.config.total_steps:,} instead of {before.config.total_steps:,}"
+    moved = schedules_moved(experiment, done, iterations)
+    return (
+        f"{said}; what changes over a training goes on from where it stands in the longer one: {moved}"
+        if moved
+        else said
+    )
 
 
 def _finish(
