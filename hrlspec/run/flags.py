@@ -50,8 +50,9 @@ def parse_flags(
         raise UserError(f"{in_flags(_reason(said.getvalue()), default)} (see {program} --help)") from None
     for name, value in vars(parsed).items():
         if isinstance(value, Path) and _ELSEWHERE.match(str(value)):
-            flag = f"--{name.replace('_', '-')}"
-            raise UserError(f"{flag} is {value}, expected a path on this machine; storage elsewhere has to be mounted")
+            raise UserError(
+                f"{flag_of(name)} is {value}, expected a path on this machine; storage elsewhere has to be mounted"
+            )
     return parsed
 
 
@@ -67,24 +68,28 @@ def in_flags(message: str | ConfigError, flags: Any) -> str:
     if found is None:
         return str(message)
     where, kind, name = found.groups()
-    places = [place for place, some in _settings(flags) if type(some).__name__ == kind]
+    places = [place for place, some in settings_in(flags) if type(some).__name__ == kind]
     if where is not None:
         place = "" if where == kind else where.replace("-", "_")  # flags themselves are called by their class
     elif len(places) == 1:
         (place,) = places
     else:
         return str(message)
+    return f"{flag_of(f'{place}.{name}')}{str(message)[found.end() :]}"
+
+
+def flag_of(name: str) -> str:
+    """The flag of a setting: ``--config.low.clip`` of ``config.low.clip``, ``--seed`` of ``.seed``."""
     # The settings of a method are told under its flag.
-    flag = f"{place}.{name}".lstrip(".").replace("method_settings", "method").replace("_", "-")
-    return f"--{flag}{str(message)[found.end() :]}"
+    return "--" + name.lstrip(".").replace("method_settings", "method").replace("_", "-")
 
 
-def _settings(flags: object, place: str = "") -> Iterator[tuple[str, Any]]:
+def settings_in(flags: object, place: str = "") -> Iterator[tuple[str, Any]]:
     """All dataclasses within a dataclass, itself included, under dotted names."""
     if dataclasses.is_dataclass(flags):
         yield place, flags
         for field in dataclasses.fields(flags):
-            yield from _settings(getattr(flags, field.name), f"{place}.{field.name}".lstrip("."))
+            yield from settings_in(getattr(flags, field.name), f"{place}.{field.name}".lstrip("."))
 
 
 def _reason(text: str) -> str:

@@ -2,13 +2,13 @@
 
 ::
 
-    config.json      everything resolved, versions, commit, command
+    config.json      everything resolved, versions, commit, command; under "earlier" those of the processes before
     metrics.jsonl    one JSON object for each evaluation, in the order of env_steps
     checkpoints/     see hrlspec.checkpoint.store
     tensorboard/     event files with the same numbers as metrics.jsonl
     plots/           pictures
     tasks/           test tasks, where the environment has no suites of its own
-    summary.json     the final results
+    summary.json     the final results; summary-<env_steps>.json those before it was made longer
 
 A row of metrics is written before the checkpoint of its step. So after a kill at any moment the rows up to the newest
 checkpoint are complete, and those after it, which the resumed run writes again, are dropped: no row appears twice.
@@ -53,12 +53,14 @@ class RunFolder:
         path: the folder.
         config: the resolved configuration as in ``config.json``.
         config_hash: its SHA-256, to be kept with each checkpoint.
+        earlier_hashes: those of the configurations that this one replaced.
         resumed: whether the folder held this run before.
     """
 
     path: Path
     config: dict[str, Any]
     config_hash: str
+    earlier_hashes: frozenset[str]
     resumed: bool
     _tensorboard: bool
     _last_step: int | None = None  # of metrics.jsonl; None until a resumed run says where it resumes
@@ -119,7 +121,7 @@ class RunFolder:
             self._events.flush()
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
-        """Writes ``summary.json``, replacing an earlier one as a whole."""
+        """Writes ``summary.json``, replacing an earlier one as a whole; it has an entry ``env_steps``."""
         _write_atomically(self.path / "summary.json", json.dumps(_plain(summary), indent=2, allow_nan=False) + "\n")
 
     def write_tasks(self, name: str, text: str) -> None:
@@ -187,14 +189,24 @@ def check_place(folder: Path, *, resume: bool) -> None:
         UserError: it holds a run, or none to resume, or something else, or cannot be written.
     """
     check_writable(folder)
+    begun = holds_run(folder)
     with _refusals_told(folder):
-        holds_run = (folder / "config.json").exists()
-        if resume and not holds_run:
+        if resume and not begun:
             raise UserError(f"there is no run to resume in {folder}")
-        if holds_run and not resume:
+        if begun and not resume:
             raise UserError(f"{folder} holds a run already: continue it with --resume, or choose another --out")
-        if not holds_run and folder.is_dir() and {entry.name for entry in folder.iterdir()} - _LEFT_BY_A_KILL:
+        if not begun and folder.is_dir() and {entry.name for entry in folder.iterdir()} - _LEFT_BY_A_KILL:
             raise UserError(f"{folder} is not empty and holds no run; choose another --out")
+
+
+def holds_run(folder: Path) -> bool:
+    """Whether a run was begun in the folder.
+
+    Raises:
+        UserError: the system does not say.
+    """
+    with _refusals_told(folder):
+        return (folder / "config.json").exists()
 
 
 def check_writable(folder: Path) -> None:
@@ -236,16 +248,29 @@ def _open(
         circumstances = _circumstances()
         record = {"format": FORMAT, "config": resolved, "config_hash": config_hash(resolved), **circumstances}
         if resume:
-            before = read_record(folder)
-            _check_same(folder, before["config"], resolved, may_change)
-            record["earlier"] = [*before.get("earlier", []), {name: before.get(name) for name in circumstances}]
+            record["earlier"] = _replaced(folder, resolved, may_change)
         _write_atomically(folder / "config.json", json.dumps(record, indent=2) + "\n")
-        run = RunFolder(folder, resolved, record["config_hash"], resume, tensorboard)
+        earlier = frozenset(entry["config_hash"] for entry in record.get("earlier", []) if "config_hash" in entry)
+        run = RunFolder(folder, resolved, record["config_hash"], earlier, resume, tensorboard)
         stack.callback(run._close_events)
         if not resume:
             run._begin(-1)
         undo.pop_all()
     return run
+
+
+def _replaced(folder: Path, config: Any, may_change: Sequence[str]) -> list[dict[str, Any]]:
+    """What the new record says of those before it. The results of another configuration are set aside."""
+    record = read_record(folder)
+    check_same(folder, record["config"], config, may_change)
+    entry = {name: value for name, value in record.items() if name not in ("format", "config", "earlier")}
+    old, new = _dotted(record["config"]), _dotted(config)
+    if old != new:
+        entry["changed"] = {name: value for name, value in old.items() if new.get(name) != value}
+        summary = read_summary(folder)
+        if summary is not None:
+            (folder / "summary.json").replace(folder / f"summary-{summary['env_steps']}.json")
+    return [*record.get("earlier", []), entry]
 
 
 def _remove_beginnings(folder: Path) -> None:
@@ -311,9 +336,19 @@ def config_hash(config: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(_plain(config), sort_keys=True).encode()).hexdigest()
 
 
-def _check_same(folder: Path, there: Any, here: Any, may_change: Sequence[str]) -> None:
-    """Refuses to continue a run under another configuration, naming the first difference."""
-    old, new = _dotted(there), _dotted(here)
+def check_same(folder: Path, there: Any, here: Any, may_change: Sequence[str]) -> None:
+    """Refuses to continue a run under another configuration.
+
+    Args:
+        folder: of the run.
+        there: its configuration, from its record.
+        here: the one it is to have.
+        may_change: dotted names of what may differ.
+
+    Raises:
+        UserError: something else differs; it names the first such difference.
+    """
+    old, new = _dotted(there), _dotted(_plain(here))
     names = [name for name in sorted(old.keys() | new.keys()) if old.get(name) != new.get(name)]
     names = [name for name in names if name not in may_change]
     if names:

@@ -16,7 +16,7 @@ from hrlspec.methods import METHODS, OURS, Method
 from hrlspec.presets import PRESETS, Recipe, RewardSet
 from hrlspec.run.errors import UserError
 from hrlspec.run.experiment import EvaluationConfig, Experiment
-from hrlspec.run.flags import in_flags, parse_flags
+from hrlspec.run.flags import flag_of, in_flags, parse_flags, settings_in
 from hrlspec.run.lookup import method_named, preset_named
 
 _FIRST = next(iter(PRESETS))
@@ -47,7 +47,8 @@ class RunFlags(Checked):
     out: Path | None = None
     """The run folder; runs/<name> if not given. With several seeds, the folder that holds seed<n>/."""
     resume: bool = False
-    """Continue what is in the folder, with the flags it was begun with; finished seeds are skipped."""
+    """Continue what is in the folder, with the flags it was begun with; finished seeds are skipped. More --total-steps
+    make a run longer, finished or not."""
     checkpoint_minutes: float = setting(1.0, least=0, most=1e6)
     """How much work a kill may cost."""
     no_max_operator: bool = False
@@ -144,6 +145,31 @@ def experiments_of(flags: RunFlags) -> list[tuple[Experiment, Path]]:
             folder = flags.out if flags.num_seeds == 1 else flags.out / f"seed{seed}"
         runs.append((experiment, folder))
     return runs
+
+
+def schedules_moved(experiment: Experiment, done: int, iterations: int) -> str:
+    """What becomes of the settings that change while training, linearly in the share that is done, in a longer run.
+
+    Args:
+        experiment: the longer run.
+        done: iterations done.
+        iterations: how many there were to be.
+
+    Returns:
+        Such as ``--config.low.entropy from 0.004 to 0.012``, with commas between; empty if nothing changes.
+    """
+    moved = []
+    for place, some in settings_in(experiment):
+        for field in dataclasses.fields(some):
+            first, last = getattr(some, field.name), getattr(some, f"final_{field.name}", None)
+            if last in (None, first) or (field.name == "entropy_floor" and not first):  # 0 stands for none
+                continue
+            was, now = (
+                first + (last - first) * min(done / total, 1)
+                for total in (iterations, experiment.config.num_iterations)
+            )
+            moved.append(f"{flag_of(f'{place}.{field.name}')} from {was:.3g} to {now:.3g}")
+    return ", ".join(moved)
 
 
 def _switched(flags: RunFlags) -> tuple[Config, Method]:

@@ -17,7 +17,7 @@ import pytest
 from tensorboardX.proto import event_pb2
 
 from hrlspec.run.errors import UserError
-from hrlspec.run.folder import config_hash, open_run, read_metrics, read_record
+from hrlspec.run.folder import config_hash, open_run, read_metrics, read_record, read_summary
 
 ROOT = Path(__file__).parents[2]
 
@@ -58,14 +58,18 @@ def test_a_new_run_records_what_it_is(tmp_path: Path) -> None:
         assert not run.resumed
         assert run.checkpoints == tmp_path / "a" / "run" / "checkpoints"
         assert run.plots.is_dir()
-        run.write_summary({"success": np.float32(0.5), "by_depth": {2: jnp.ones(2)}})
+        run.write_summary({"env_steps": 10, "success": np.float32(0.5), "by_depth": {2: jnp.ones(2)}})
     record = read_record(run.path)
     assert record["config"] == run.config
     assert run.config == {"seed": 0, "total_steps": 10, "rate": 1e-3, "network": {"sizes": [64, 32]}}
     assert record["config_hash"] == run.config_hash == config_hash(run.config)
     assert {"hrlspec", "jax", "numpy", "python"} <= record["versions"].keys()
     assert record["commit"] is None or len(record["commit"].removesuffix("+changes")) == 40
-    assert json.loads((run.path / "summary.json").read_text()) == {"success": 0.5, "by_depth": {"2": [1.0, 1.0]}}
+    assert json.loads((run.path / "summary.json").read_text()) == {
+        "env_steps": 10,
+        "success": 0.5,
+        "by_depth": {"2": [1.0, 1.0]},
+    }
 
 
 def test_the_commit_is_that_of_the_code_not_of_the_working_directory(
@@ -129,7 +133,7 @@ def test_a_resumed_run_has_each_row_once(tmp_path: Path) -> None:
     rows = [(row["env_steps"], row["process"]) for row in read_metrics(tmp_path)]
     assert rows == [(0, 1), (10, 1), (20, 2), (30, 2)]
     record = read_record(tmp_path)
-    assert set(record["earlier"][0]) == set(record) - {"format", "config", "config_hash", "earlier"}
+    assert set(record["earlier"][0]) == set(record) - {"format", "config", "earlier"}
     first, second = sorted((tmp_path / "tensorboard").iterdir(), key=lambda file: file.suffix)
     assert [step for step, _ in scalars(first)] == [0, 10, 20, 30]
     assert scalars(second) == [(20, 2.0), (30, 2.0)]
@@ -167,11 +171,20 @@ def test_another_run_is_never_touched(tmp_path: Path) -> None:
 
 
 def test_what_may_change_is_recorded(tmp_path: Path) -> None:
-    with open_run(tmp_path, Config()):
-        pass
-    with open_run(tmp_path, Config(total_steps=20), resume=True, may_change=("total_steps",)) as run:
-        run.rewind(-1)
-    assert read_record(tmp_path)["config"]["total_steps"] == 20
+    with open_run(tmp_path, Config()) as run:
+        run.write_summary({"env_steps": 10})
+        first = run.config_hash
+        assert run.earlier_hashes == frozenset()
+    for _ in range(2):  # as it was, it needs no leave to change
+        with open_run(tmp_path, Config(total_steps=20), resume=True, may_change=("total_steps",)) as run:
+            run.rewind(-1)
+            assert first in run.earlier_hashes
+            assert first != run.config_hash
+    record = read_record(tmp_path)
+    assert record["config"]["total_steps"] == 20
+    assert [entry.get("changed") for entry in record["earlier"]] == [{"total_steps": 10}, None]
+    assert read_summary(tmp_path) is None  # the results of a shorter run are not this one's
+    assert json.loads((tmp_path / "summary-10.json").read_text()) == {"env_steps": 10}
 
 
 def test_places_that_are_refused_stay_as_they_are(tmp_path: Path) -> None:

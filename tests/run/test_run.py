@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -115,10 +116,35 @@ def test_a_finished_run_is_left_alone(finished: Path, capsys: pytest.CaptureFixt
     assert call(*tiny.arguments(finished)) == 2
     assert "holds a run already" in capsys.readouterr().err
     assert call(*tiny.arguments(finished, "--resume", "--seed", "1")) == 2
-    assert "finished run with other settings" in capsys.readouterr().err
+    assert "begun with seed = 0, not 1" in capsys.readouterr().err
+    assert call(*tiny.arguments(finished, "--resume", "--total-steps", str(tiny.TOTAL - 1))) == 2
+    assert f"begun with --total-steps {tiny.TOTAL}: give more, or the same" in capsys.readouterr().err
+    assert call(*tiny.arguments(finished, "--resume", "--config.total-steps", "9999")) == 0
+    assert "is finished" in capsys.readouterr().out  # --total-steps prevails
     assert call(*tiny.arguments(finished, "--resume")) == 0
     assert "is finished" in capsys.readouterr().out
     assert {file: file.stat().st_mtime_ns for file in finished.rglob("*")} == before
+
+
+@pytest.mark.slow
+def test_a_finished_run_becomes_longer(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "longer"
+    shutil.copytree(finished, folder)
+    longer = tiny.TOTAL + 1  # one iteration more
+    assert call(*tiny.arguments(folder, "--resume", "--total-steps", str(longer))) == 0
+    err = capsys.readouterr().err
+    assert f"continuing after {tiny.TOTAL:,} steps, now to {longer:,} instead of {tiny.TOTAL:,}; what changes " in err
+    assert "--config.low.entropy from 0.004 to 0.00523, " in err  # 0.02 to 0.004, 12/13 of the way
+    assert "--config.low.optimiser.learning-rate from 0 to 5.38e-05, " in err
+    assert "--method.high.ppo.optimiser.learning-rate from 0 to 2.31e-05\n" in err
+    before, after = rows(finished), rows(folder)
+    assert after[: len(before)] == before
+    assert [row["env_steps"] for row in after[len(before) :]] == [tiny.TOTAL + tiny.STEPS]
+    assert json.loads((folder / "summary.json").read_text())["env_steps"] == tiny.TOTAL + tiny.STEPS
+    assert (folder / f"summary-{tiny.TOTAL}.json").read_bytes() == (finished / "summary.json").read_bytes()
+    assert read_record(folder)["earlier"][0]["changed"] == {"config.total_steps": tiny.TOTAL}
+    assert call(*tiny.arguments(folder, "--resume")) == 2
+    assert f"begun with --total-steps {longer}: give more, or the same" in capsys.readouterr().err
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from hrlspec.run.commands import run
 from hrlspec.run.errors import UserError, main_guard
 from hrlspec.run.experiment import Experiment, experiment_of
 from hrlspec.run.folder import config_hash, open_run
-from hrlspec.run.run_flags import experiments_of, parse_run
+from hrlspec.run.run_flags import experiments_of, parse_run, schedules_moved
 
 ROOT = Path(__file__).parents[2]
 
@@ -88,7 +88,11 @@ BAD_FLAGS = [
     ("--num-seeds 2 --out missing --resume", "no run to resume in missing/seed0"),
     ("--out other", "other holds a run already: continue it with --resume"),
     ("--out other --resume", "other was begun with seed = 7, not 0"),
+    ("--out other --seed 7 --resume --total-steps 100", "other was begun with --total-steps 2500000: give more, or"),
+    ("--out other --seed 7 --resume --config.total-steps 9999999", "config.total_steps = 2500000, not 9999999"),
     ("--out damaged --resume", "cannot read damaged"),
+    (f"--out {'n' * 300}", "cannot write to nnn"),
+    ("--out gs://bucket/run", "--out is gs:/bucket/run, expected a path on this machine"),
 ]
 
 
@@ -198,6 +202,22 @@ def test_switches_and_overrides() -> None:
     curriculum = made("--no-curriculum").config.curriculum
     assert curriculum.promotion == curriculum.window == 0
     assert curriculum.earlier == pytest.approx(1 - 1 / curriculum.levels)
+
+
+def test_what_a_longer_run_does_to_schedules() -> None:
+    def said(*flags: str) -> str:
+        return schedules_moved(experiments_of(parse_run([*flags, "--total-steps", str(2 * 10 * 8192)]))[0][0], 10, 10)
+
+    sizes = "--config.num-envs", "128", "--config.num-steps", "64"
+    assert said(*sizes) == (
+        "--config.low.entropy from 0.004 to 0.012, --config.low.entropy-floor from 0.03 to 0.075, "
+        "--config.low.optimiser.learning-rate from 0 to 0.00035, "
+        "--method.high.ppo.optimiser.learning-rate from 0 to 0.00015"
+    )
+    assert "floor" not in said(*sizes, "--config.low.entropy-floor", "0")
+    assert said(*sizes, "--method", "option", "--config.low.entropy", "0.1", "--config.low.final-entropy", "0.1") == (
+        "--config.low.entropy-floor from 0.03 to 0.075, --config.low.optimiser.learning-rate from 0 to 0.0007"
+    )
 
 
 def test_no_curriculum_reaches_the_last_level_at_once() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -214,12 +215,24 @@ def test_a_run_killed_before_its_first_checkpoint_begins_anew(
 
 def test_checkpoints_of_another_run_are_refused(tmp_path: Path) -> None:
     train(tmp_path / "a", toy())
-    with pytest.raises(Interrupted):
-        train(tmp_path / "b", toy(), Recorder(2, stop))
-    with open_run(tmp_path / "b", {"seed": 1}, resume=True, may_change=("seed",), tensorboard=False) as run:
+    with open_run(tmp_path / "b", {"seed": 1}, tensorboard=False):
+        pass
+    shutil.copytree(tmp_path / "a" / "checkpoints", tmp_path / "b" / "checkpoints")
+    with open_run(tmp_path / "b", {"seed": 1}, resume=True, tensorboard=False) as run:
         it = Loop(toy(), run, Recorder(), checkpoint_seconds=1e9)
         with pytest.raises(checkpoint.CheckpointMismatchError, match="belongs to another run"):
             it.restore()
+
+
+def test_a_finished_run_becomes_longer(tmp_path: Path, reference: tuple[Path, str, list[float]]) -> None:
+    """Where nothing depends on the share that is done it ends as if it had been of that length at once."""
+    for length, resume in ((7, False), (9, True), (ITERATIONS, True)):
+        config = {"length": length}
+        with open_run(tmp_path, config, resume=resume, may_change=("length",), tensorboard=False) as run:
+            it = Loop(toy(num_iterations=length), run, Recorder(), checkpoint_seconds=1e9)
+            state = it.train(it.restore())
+    assert state_hash(state) == reference[1]
+    assert [row["env_steps"] for row in read_metrics(tmp_path)] == [24, 40, 56, 64, 72, 80, 104]
 
 
 def skipping(first: int, last: int) -> Callable[[Any, int], Any]:
