@@ -174,6 +174,9 @@ class Environment(abc.ABC):
         """The traced parameters as the preset has them."""
         return EnvParams(horizon=jnp.int32(self.horizon))
 
+    def check_installed(self) -> None:  # noqa: B027  # most need none
+        """Raises ``ImportError``, naming what to install, if a library that its steps need is missing."""
+
     @abc.abstractmethod
     def resample_layout(
         self, key: Key[Array, ""], layout: Layout, needed: Bool[Array, ""], params: EnvParams

@@ -12,8 +12,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from experiments.paper.making import command, make
 from experiments.paper.panels import (
     NUM_SEEDS,
@@ -29,6 +27,7 @@ from experiments.paper.records import read_records, record_of
 from hrlspec.presets import RECIPES
 from hrlspec.run.checkout import check_checkout
 from hrlspec.run.cli import call
+from hrlspec.run.console import PlainConsole
 from hrlspec.run.errors import UserError
 from hrlspec.run.flags import parse_flags
 
@@ -74,7 +73,7 @@ def main(argv: Sequence[str], *, program: str = "hrlspec reproduce") -> None:
     flags = parse_flags(ReproduceFlags, argv, program=program)
     _check(flags)
     check_checkout("reproduce")
-    console = Console(stderr=True)
+    console = PlainConsole(stderr=True)
     panels = [panel for name, panel in (PANELS | TUNING).items() if name in (flags.only or PANELS)]
     runs = _runs(panels, flags)
     known = read_records(runs, flags.out)
@@ -83,7 +82,7 @@ def main(argv: Sequence[str], *, program: str = "hrlspec reproduce") -> None:
     to_draw = (not flags.only or TRAJECTORIES in flags.only) and not picture.exists()
     if to_draw and shown not in missing and record_of(flags.work / shown.name) is None:
         missing.append(shown)  # its checkpoint is gone, or it is of no panel asked for
-    console.print(f"{len({*runs, *missing})} runs, {len(missing)} of them missing", highlight=False)
+    console.say(f"{len({*runs, *missing})} runs, {len(missing)} of them missing")
     if flags.dry_run:
         for run in missing:
             print(" ".join(command(run, flags.work)[1:]))
@@ -93,7 +92,7 @@ def main(argv: Sequence[str], *, program: str = "hrlspec reproduce") -> None:
             make(missing, work=flags.work, records=flags.out, jobs=flags.jobs, console=console)
         if to_draw:
             _draw_trajectories(flags.work / shown.name, picture)
-            console.print(f"written: {picture}", highlight=False)
+            console.say(f"written: {picture}")
     # The drawing library is an extra, and takes a second to load.
     from experiments.paper.report import write_report
 
@@ -101,7 +100,7 @@ def main(argv: Sequence[str], *, program: str = "hrlspec reproduce") -> None:
     everything = dataclasses.replace(flags, recipes=RECIPES, seeds=max(flags.seeds, NUM_SEEDS))
     records = read_records(_runs([*PANELS.values(), *TUNING.values()], everything), flags.out)
     for file in write_report(panels, records, flags.out, flags.report):
-        console.print(f"written: {file}", highlight=False)
+        console.say(f"written: {file}")
 
 
 def _check(flags: ReproduceFlags) -> None:

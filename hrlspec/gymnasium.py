@@ -8,8 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import gymnasium
-
 import envs_jax
 from envs_jax import Environment
 from envs_jax.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
@@ -51,6 +49,8 @@ def register(namespace: str = "hrlspec") -> tuple[str, ...]:
     Returns:
         The ids, such as ``hrlspec/letter-v0``.
     """
+    import gymnasium  # after the adapter, which says which extra it belongs to
+
     ids = []
     for name in envs_jax.registered():
         ids.append(f"{namespace}/{name}-v0")

@@ -22,7 +22,7 @@ from envs_jax.scenes import DiscScene, Region
 from envs_jax.zone import physics as zone_physics
 from envs_jax.zone.contested import contested_layout
 from envs_jax.zone.layouts import COLOURS, ZONES_EACH, ZoneLayout, new_layout
-from envs_jax.zone.physics import NUM_SENSORS, Backend
+from envs_jax.zone.physics import NUM_SENSORS, Backend, import_mjx
 
 LIDAR_BINS = 16
 BOUNDARY = 3.3
@@ -198,6 +198,11 @@ class Zone(Symmetric, ContestedChoice, Drawable):
         zones = state.layout.zones[jnp.argmax(goal)]
         dx, dy = zones[:, 0] - state.body[0], zones[:, 1] - state.body[1]
         return jnp.argmin(dx * dx + dy * dy).astype(jnp.int32)
+
+    def check_installed(self) -> None:
+        """Raises ``ImportError`` without MuJoCo, unless the physics is that in closed form."""
+        if self.physics == "mjx":
+            import_mjx()
 
     def check_layout(self, layout: ZoneLayout) -> None:
         """Raises ``ValueError`` unless everything is finite and lies inside the square.

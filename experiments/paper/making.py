@@ -11,10 +11,9 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from experiments.paper.panels import Run
 from experiments.paper.records import Record, add_record, read_records, record_of
+from hrlspec.run.console import PlainConsole
 from hrlspec.run.errors import Interrupted, UserError
 from hrlspec.run.folder import read_metrics
 from hrlspec.run.progress import duration
@@ -24,7 +23,7 @@ POLL_SECONDS = 2.0
 LINE_SECONDS = 60.0
 
 
-def make(runs: Sequence[Run], *, work: Path, records: Path, jobs: int | None, console: Console) -> None:
+def make(runs: Sequence[Run], *, work: Path, records: Path, jobs: int | None, console: PlainConsole) -> None:
     """Makes runs from the beginning, or from where they were left.
 
     Args:
@@ -133,14 +132,14 @@ def _end(running: Mapping[Run, tuple[subprocess.Popen[bytes], Place]]) -> None:
 class _Meter:
     """Says how far everything is and how long it will take, from the steps done since the start."""
 
-    def __init__(self, runs: Sequence[Run], work: Path, console: Console) -> None:
+    def __init__(self, runs: Sequence[Run], work: Path, console: PlainConsole) -> None:
         self._work, self._console = work, console
         self._steps = {run: _done(run, work) for run in runs}
         self._before, self._began, self._said = sum(self._steps.values()), time.monotonic(), time.monotonic()
 
     def note(self, line: str) -> None:
         """Prints a line."""
-        self._console.print(line, highlight=False, soft_wrap=True)
+        self._console.say(line)
 
     def finished(self, run: Run) -> None:
         """Counts all steps of a run."""

@@ -51,6 +51,12 @@ def main_guard(main: Callable[[], None]) -> int:
     return OK
 
 
+def in_words(error: Exception) -> str:
+    """Whatever somebody else's code raised, on one line, of which there is not much."""
+    said = " ".join(str(error).split())
+    return f"{type(error).__name__}: {said[:200] or 'without a message'}"
+
+
 def _expected() -> tuple[type[Exception], ...]:
     """What the user can mend. Imported when needed: these modules take seconds, and signals come meanwhile."""
     from hrlspec.checkpoint import CheckpointError

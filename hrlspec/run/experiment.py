@@ -84,8 +84,17 @@ class Experiment:
 
     @property
     def agent(self) -> Agent:
-        """The agent, without parameters."""
-        return Agent(self.preset.make(), self.config, self.method_settings)
+        """The agent, without parameters.
+
+        Raises:
+            UserError: a library that its environment needs is missing.
+        """
+        env = self.preset.make()
+        try:
+            env.check_installed()
+        except ImportError as error:
+            raise UserError(str(error)) from error
+        return Agent(env, self.config, self.method_settings)
 
     @property
     def rewards(self) -> RewardMachine:

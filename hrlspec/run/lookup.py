@@ -13,7 +13,7 @@ from typing import Any
 from envs_jax import Environment
 from hrlspec.methods import METHODS, Method
 from hrlspec.presets import PRESETS, Preset, preset, preset_for
-from hrlspec.run.errors import UserError
+from hrlspec.run.errors import UserError, in_words
 from hrlspec.spec import SpecError, parse
 
 
@@ -93,5 +93,4 @@ def _not_ours(name: str) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:  # anything, since it is not our code
-        said = " ".join(str(error).split()) or "without a message"
-        raise UserError(f"{name} cannot be used: {type(error).__name__}: {said}") from error
+        raise UserError(f"{name} cannot be used: {in_words(error)}") from error

@@ -1,4 +1,4 @@
-"""Live progress of a run: a bar with steps/s, level, success and time left; plain lines where there is no terminal."""
+"""Live progress of a run: a bar with steps/s, level, success and time left; plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import time
 from collections.abc import Mapping
 from typing import Any, Self
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
+
+from hrlspec.run.console import PlainConsole
 
 LINE_SECONDS = 10.0  # between plain lines
 _MEMORY = 0.95  # weight of the past in the moving averages
@@ -24,19 +25,19 @@ class ProgressDisplay:
         begin: environment steps that are done already.
     """
 
-    def __init__(self, total: int, name: str, *, console: Console | None = None, begin: int = 0) -> None:
-        self._console = console or Console(stderr=True)
+    def __init__(self, total: int, name: str, *, console: PlainConsole | None = None, begin: int = 0) -> None:
+        self._console = console or PlainConsole(stderr=True)
         self._total, self._name, self._done = total, name, begin
         self._rate: float | None = None
         self._success: float | None = None
         self._mark: float | None = None  # when the latest iteration ended
         self._last_line = time.monotonic()
         self._bar: Progress | None = None
-        if self._console.is_terminal:
+        if self._console.is_terminal and not self._console.is_dumb_terminal:
             columns: list[ProgressColumn] = [
-                TextColumn("{task.description}"),
+                TextColumn("{task.description}", markup=False),
                 BarColumn(bar_width=None),
-                TextColumn("{task.fields[status]}"),
+                TextColumn("{task.fields[status]}", markup=False),
                 _TimeLeft(),
             ]
             self._bar = Progress(*columns, console=self._console, expand=True, transient=True)
@@ -46,7 +47,7 @@ class ProgressDisplay:
         if self._bar is not None:
             self._bar.start()
         else:
-            self._print(f"{self._name}: compiling")
+            self._console.say(f"{self._name}: compiling")
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -72,7 +73,7 @@ class ProgressDisplay:
         elif now - self._last_line >= LINE_SECONDS:
             self._last_line = now
             left = self._seconds_left()
-            self._print(f"{self._name}: {status}" + ("" if left is None else f", {duration(left)} left"))
+            self._console.say(f"{self._name}: {status}" + ("" if left is None else f", {duration(left)} left"))
 
     def row(self, row: Mapping[str, Any]) -> None:
         """An evaluation is done: its main numbers, as a line that stays."""
@@ -83,15 +84,12 @@ class ProgressDisplay:
             "eval/spl": "SPL",
         }
         values = [f"{label} {row[name]:.3f}" for name, label in names.items() if isinstance(row.get(name), float)]
-        self._print(f"{self._name}: {row['env_steps']:,} steps, unseen tasks: {', '.join(values)}")
+        self._console.say(f"{self._name}: {row['env_steps']:,} steps, unseen tasks: {', '.join(values)}")
         self._mark = None  # the evaluation's time is not training's
 
     def note(self, text: str) -> None:
         """Something worth saying, as a line that stays."""
-        self._print(f"{self._name}: {text}")
-
-    def _print(self, line: str) -> None:
-        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+        self._console.say(f"{self._name}: {text}")
 
     def _status(self, metrics: Mapping[str, float]) -> str:
         parts = [f"{self._done:,}/{self._total:,} steps"]

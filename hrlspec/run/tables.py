@@ -7,7 +7,6 @@ import re
 from collections.abc import Mapping, Sequence
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from hrlspec.evaluation import Aggregate, SuiteResult
@@ -21,12 +20,6 @@ _NAMES = {
     "steps_mean": "steps",
     "spl": "SPL",
 }
-
-
-def result_console() -> Console:
-    """Standard output; where it is no terminal, wide enough for any table."""
-    console = Console()
-    return console if console.is_terminal else Console(width=100)
 
 
 def suite_table(result: SuiteResult) -> Table:

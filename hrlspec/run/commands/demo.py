@@ -29,10 +29,13 @@ from hrlspec.learning.train import Trainer
 from hrlspec.presets import Preset, RewardSet
 from hrlspec.presets.demos import DILEMMA, ROOMS
 from hrlspec.run import platform
+from hrlspec.run.console import result_console
+from hrlspec.run.extras import check_drawing, drawing
 from hrlspec.run.flags import parse_flags
+from hrlspec.run.folder import check_writable
 from hrlspec.run.programs import Program
 from hrlspec.run.progress import ProgressDisplay
-from hrlspec.run.tables import plain_table, result_console
+from hrlspec.run.tables import plain_table
 from hrlspec.spec import TaskTree
 from hrlspec.tasks.bank import TaskBanks
 from hrlspec.tasks.rewards import Bonus, RewardMachine, reward_machine
@@ -107,11 +110,14 @@ def main(argv: Sequence[str], *, program: str = "hrlspec demo") -> None:
     flags = parse_flags(DemoFlags, argv, program=program)
     demo = DEMOS[flags.world]
     steps = demo.steps if flags.steps is None else flags.steps
+    check_writable(flags.out)
+    check_drawing()
     platform.prepare()
     shown = {method: act(demo, train(demo, method, steps, flags.seed), flags.seed) for method in demo.methods}
     result_console().print(table(demo, shown))
-    flags.out.mkdir(parents=True, exist_ok=True)
-    print(f"picture: {draw(demo, shown, flags.out / f'demo-{flags.world}.png')}")
+    with drawing():
+        flags.out.mkdir(parents=True, exist_ok=True)
+        print(f"picture: {draw(demo, shown, flags.out / f'demo-{flags.world}.png')}")
 
 
 def train(demo: Demo, method: str, steps: int, seed: int) -> tuple[Agent, Params]:
@@ -181,7 +187,7 @@ def draw(demo: Demo, shown: dict[str, Shown], file: Path) -> Path:
     """One episode of each method, in the same layout: the one where most is at stake."""
     from matplotlib.figure import Figure
 
-    from hrlspec.run import plots  # imports matplotlib
+    from hrlspec.run import plots
 
     steps_of_ways = [*ways(demo, shown).values()]
     index = int(np.argmax(steps_of_ways[-1] - steps_of_ways[0])) if steps_of_ways else 0

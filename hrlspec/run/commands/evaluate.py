@@ -19,14 +19,16 @@ from hrlspec.agent.agent import Agent
 from hrlspec.agent.low_level import Params
 from hrlspec.api import TrainedAgent, evaluate
 from hrlspec.config import Checked, setting
-from hrlspec.evaluation import Suite, suite_from_text
+from hrlspec.evaluation import Suite, SuiteResult, suite_from_text
 from hrlspec.evaluation.suite import MAX_NODES
 from hrlspec.run import platform
+from hrlspec.run.console import result_console
 from hrlspec.run.errors import UserError
 from hrlspec.run.experiment import Experiment, experiment_of
+from hrlspec.run.extras import check_drawing, drawing
 from hrlspec.run.flags import parse_flags
-from hrlspec.run.folder import read_record
-from hrlspec.run.tables import result_console, suite_table
+from hrlspec.run.folder import check_writable, read_record
+from hrlspec.run.tables import suite_table
 from hrlspec.run.unseen import with_tasks
 from hrlspec.spec import bare_lines
 
@@ -98,19 +100,23 @@ def main(argv: Sequence[str], *, program: str = "hrlspec evaluate") -> None:
         )
     except ValueError as error:
         raise UserError(str(error)) from error  # a task that nothing can satisfy
+    _show(flags, result, {"run": str(flags.run), "checkpoint_step": step, "reward_set": experiment.reward_set})
     if flags.draw is not None:
-        _draw(flags, agent, params, experiment, suite)
+        with drawing():
+            _draw(flags, agent, params, experiment, suite)
+
+
+def _show(flags: EvaluateFlags, result: SuiteResult, facts: dict[str, Any]) -> None:
+    """Prints the results."""
     if flags.json:
-        facts: dict[str, Any] = {"run": str(flags.run), "checkpoint_step": step, "reward_set": experiment.reward_set}
-        print(json.dumps({**facts, **result.to_json()}, allow_nan=False))
+        print(json.dumps({**facts, **result.to_json()}, allow_nan=False), flush=True)
         return
     console = result_console()
     console.print(suite_table(result))
-    if 1 < len(suite) <= 20:
+    if 1 < len(result.per_task) <= 20:
         for task in result.per_task:
             score = task.score
-            line = f"{score.success_rate.estimate:.3f}  {task.task}"
-            console.print(line, markup=False, highlight=False, soft_wrap=True)
+            console.say(f"{score.success_rate.estimate:.3f}  {task.task}")
 
 
 def _draw(flags: EvaluateFlags, agent: Agent, params: Params, experiment: Experiment, suite: Suite) -> None:
@@ -171,3 +177,8 @@ def _check(flags: EvaluateFlags) -> None:
         raise UserError(f"expected exactly one of --spec, --spec-file and --suite, found {found}")
     if flags.draw is not None and flags.draw.suffix not in (".png", ".svg"):
         raise UserError(f"--draw {flags.draw}: expected a file that ends in .png or .svg")
+    if flags.draw is not None:
+        if flags.draw.is_dir():
+            raise UserError(f"--draw {flags.draw}: expected a file, found a folder")
+        check_writable(flags.draw.parent)
+        check_drawing()

@@ -6,17 +6,18 @@ input, 130 interrupted with a checkpoint written.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
-from rich.console import Console
 
 from hrlspec.evaluation import SuiteResult, aggregate
 from hrlspec.run import platform
+from hrlspec.run.console import PlainConsole, result_console
 from hrlspec.run.errors import UserError
 from hrlspec.run.experiment import Experiment, experiment_of
+from hrlspec.run.extras import drawing
 from hrlspec.run.folder import (
     RunFolder,
     check_place,
@@ -32,7 +33,7 @@ from hrlspec.run.loop import DivergedError, Loop
 from hrlspec.run.progress import ProgressDisplay, duration
 from hrlspec.run.run_flags import RunFlags, experiments_of, parse_run, schedules_moved
 from hrlspec.run.signals import ended_by_signals
-from hrlspec.run.tables import aggregate_table, final_tables, result_console
+from hrlspec.run.tables import aggregate_table, final_tables
 from hrlspec.run.unseen import with_tasks
 
 
@@ -96,15 +97,16 @@ def _results(experiment: Experiment, folder: Path) -> dict[str, Any] | None:
     """The summary of a run that is finished, unless it is to become longer."""
     summary = read_summary(folder)
     config = experiment.config
-    over = summary is not None and summary.get("env_steps", 0) >= config.num_iterations * config.steps_per_iteration
-    return summary if over else None
+    if summary is None or "pictures" not in summary:
+        return None
+    return summary if summary["env_steps"] >= config.num_iterations * config.steps_per_iteration else None
 
 
-def _run(experiment: Experiment, folder: Path, resume: bool, flags: RunFlags, console: Console) -> dict[str, Any]:
+def _run(experiment: Experiment, folder: Path, resume: bool, flags: RunFlags, console: PlainConsole) -> dict[str, Any]:
     """One run from its beginning, or from where it was left, to its summary."""
     summary = _results(experiment, folder) if resume else None
     if summary is not None:
-        console.print(f"{folder} is finished; its results are in summary.json", highlight=False, soft_wrap=True)
+        console.say(f"{folder} is finished; its results are in summary.json")
         return summary
     before = experiment_of(read_record(folder)["config"], str(folder)) if resume else experiment
     preset = with_tasks(experiment.preset, folder, experiment.seed)
@@ -124,7 +126,7 @@ def _run(experiment: Experiment, folder: Path, resume: bool, flags: RunFlags, co
             except DivergedError as error:
                 raise SystemExit(f"error: {error}") from None
         wall = loop.position.wall
-        console.print(f"{experiment.name}: trained in {duration(wall)}; evaluating", highlight=False, soft_wrap=True)
+        console.say(f"{experiment.name}: trained in {duration(wall)}; evaluating")
         with ended_by_signals(f"during the final evaluation; training is saved in {folder}, --resume ends it"):
             return _finish(learner, run, state.params, total, wall, console)
 
@@ -137,43 +139,50 @@ def _continuing(experiment: Experiment, before: Experiment, done: int) -> str:
         return said
     said += f", now to {experiment.config.total_steps:,} instead of {before.config.total_steps:,}"
     moved = schedules_moved(experiment, done, iterations)
-    return (
-        f"{said}; what changes over a training goes on from where it stands in the longer one: {moved}"
-        if moved
-        else said
-    )
+    if moved:
+        said += f"; what changes while training is where the longer one puts it: {moved}"
+    return said
 
 
 def _finish(
-    learner: Learner, run: RunFolder, params: Any, env_steps: int, wall: float, console: Console
+    learner: Learner, run: RunFolder, params: Any, env_steps: int, wall: float, console: PlainConsole
 ) -> dict[str, Any]:
-    """Evaluates, prints, draws; the summary comes last and so says that nothing is missing."""
+    """Evaluates, writes the results, prints them, draws; the summary names the pictures once nothing is missing."""
     results = learner.final_results(params)
-    for table in final_tables(results):
-        console.print(table)
-    pictures = _draw(learner, run, params, console)
     summary = {
         "name": learner.experiment.name,
         "env_steps": env_steps,
         "wall_s": wall,
         "steps_per_s": env_steps / wall,  # compilation and evaluations included
         "final": results.to_json(),
-        "pictures": pictures,
     }
     run.write_summary(summary)
-    console.print(f"results, curves and pictures: {run.path}", highlight=False, soft_wrap=True)
+    for table in final_tables(results):
+        console.print(table)
+    pictures = []
+    try:
+        for file in _draw(learner, run, params):
+            pictures.append(str(file.relative_to(run.path)))
+    except UserError as error:
+        console.say(str(error))
+    run.write_summary({**summary, "pictures": pictures})
+    console.say(f"results, curves and pictures: {run.path}")
     written = read_summary(run.path)
     assert written is not None
     return written
 
 
-def _draw(learner: Learner, run: RunFolder, params: Any, console: Console) -> list[str]:
-    """Learning curves and example trajectories; a missing extra costs the pictures, not the results."""
-    try:
+def _draw(learner: Learner, run: RunFolder, params: Any) -> Iterator[Path]:
+    """Learning curves and example trajectories, one after the other.
+
+    Raises:
+        UserError: one cannot be drawn, which costs the pictures and not the results.
+    """
+    with drawing():
         from hrlspec.run import plots
 
-        files = [plots.learning_curves({learner.experiment.name: read_metrics(run.path)}, run.plots / "curves.png")]
-        files += plots.examples(
+        yield plots.learning_curves({learner.experiment.name: read_metrics(run.path)}, run.plots / "curves.png")
+        yield from plots.examples(
             jax.random.key(learner.experiment.seed),
             learner.agent,
             params,
@@ -181,7 +190,3 @@ def _draw(learner: Learner, run: RunFolder, params: Any, console: Console) -> li
             learner.test_suite,
             run.plots,
         )
-    except ImportError as error:
-        console.print(f'no pictures ({error}): pip install "hrlspec\\[plot]"', soft_wrap=True)
-        return []
-    return [str(file.relative_to(run.path)) for file in files]
