@@ -115,10 +115,8 @@ class RunFolder:
             file.flush()
             os.fsync(file.fileno())
         if self._events is not None:
-            for name, value in plain.items():
-                if isinstance(value, int | float) and name != "env_steps":
-                    self._events.add_scalar(name, value, plain["env_steps"])
-            self._events.flush()
+            numbers = {name: value for name, value in plain.items() if isinstance(value, int | float)}
+            self._events.add(numbers.pop("env_steps"), numbers)
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """Writes ``summary.json``, replacing an earlier one as a whole; it has an entry ``env_steps``."""
@@ -136,19 +134,10 @@ class RunFolder:
         if not self._tensorboard:
             return
         try:
-            from tensorboardX import SummaryWriter
+            from hrlspec.run.events import EventFile
         except ImportError as error:
             raise UserError('TensorBoard event files need the extra "cli": pip install "hrlspec[cli]"') from error
-        self._close_events()
-        folder = self.path / "tensorboard"
-        suffix = f".{len(list(folder.iterdir())) if folder.exists() else 0}"  # else two within a second share a file
-        purge_step = env_steps + 1 if self.resumed else None
-        self._events = SummaryWriter(str(folder), purge_step=purge_step, filename_suffix=suffix)
-
-    def _close_events(self) -> None:
-        if self._events is not None:
-            self._events.close()
-            self._events = None
+        self._events = EventFile(self.path / "tensorboard", env_steps + 1 if self.resumed else None)
 
 
 @contextlib.contextmanager
@@ -252,7 +241,6 @@ def _open(
         _write_atomically(folder / "config.json", json.dumps(record, indent=2) + "\n")
         earlier = frozenset(entry["config_hash"] for entry in record.get("earlier", []) if "config_hash" in entry)
         run = RunFolder(folder, resolved, record["config_hash"], earlier, resume, tensorboard)
-        stack.callback(run._close_events)
         if not resume:
             run._begin(-1)
         undo.pop_all()

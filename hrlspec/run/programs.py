@@ -15,6 +15,7 @@ import os
 import pickle
 import platform
 import stat
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -118,7 +119,7 @@ def _own(folder: Path) -> Path | None:
 
 def _not_own(found: os.stat_result) -> str | None:
     """What is wrong if others may have written there; loading a program runs code."""
-    if not hasattr(os, "geteuid") or found.st_uid != os.geteuid():
+    if sys.platform == "win32" or found.st_uid != os.geteuid():
         return "it belongs to somebody else"
     return "others may write there" if found.st_mode & _OTHERS_MAY_WRITE or stat.S_ISLNK(found.st_mode) else None
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from tensorboardX.proto import event_pb2
+from tensorboardX.record_writer import RecordWriter
 
 from hrlspec.run.errors import UserError
 from hrlspec.run.folder import config_hash, open_run, read_metrics, read_record, read_summary
@@ -101,6 +102,30 @@ def test_rows_are_plain_json_and_go_to_tensorboard(tmp_path: Path) -> None:
     ]
     (file,) = (tmp_path / "tensorboard").iterdir()
     assert scalars(file) == [(2**33, 0.25)]
+
+
+def test_records_of_event_files_are_those_of_the_library(tmp_path: Path) -> None:
+    with open_run(tmp_path / "run", Config()) as run:
+        run.append({"env_steps": 3, "loss": 0.5})
+    (file,) = (tmp_path / "run" / "tensorboard").iterdir()
+    writer = RecordWriter(str(tmp_path / "expected"))
+    for event in events(file):
+        writer.write(event.SerializeToString())
+    writer.close()
+    assert file.read_bytes() == (tmp_path / "expected").read_bytes()
+    assert "tfevents" in file.name
+
+
+def test_event_files_that_cannot_be_written_stop_nothing(tmp_path: Path) -> None:
+    with open_run(tmp_path, Config()) as run:
+        run.append({"env_steps": 1, "loss": 0.5})
+        (file,) = (tmp_path / "tensorboard").iterdir()
+        file.rename(tmp_path / "before")
+        file.mkdir()
+        for step in range(2, 40):
+            run.append({"env_steps": step, "loss": 0.5})
+    assert len(read_metrics(tmp_path)) == 39
+    assert scalars(tmp_path / "before") == [(1, 0.5)]
 
 
 def test_bad_rows_are_bugs(tmp_path: Path) -> None:
@@ -234,7 +259,7 @@ def test_what_cannot_begin_leaves_nothing(
     if failing == "config.json":
         monkeypatch.setattr(os, "fsync", full)
     else:
-        monkeypatch.setattr("tensorboardX.SummaryWriter", full)
+        monkeypatch.setattr("hrlspec.run.events.EventFile.__init__", full)
     with pytest.raises(UserError, match=r"cannot write to .*b: No space left on device"), open_run(folder, Config()):
         pass
     assert contents(tmp_path) == before
