@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import errno
 import hashlib
 import json
 import logging
@@ -233,7 +234,9 @@ def _write(folder: Path, leaves: Mapping[str, Leaf], metadata: Mapping[str, Any]
             try:
                 checkpointer.save(path, arrays)
             except Exception as error:  # the storage's own, of several types
-                raise error if isinstance(error, OSError) else OSError(" ".join(str(error).split())[:200]) from error
+                if isinstance(error, OSError):
+                    raise
+                raise OSError(errno.EIO, " ".join(str(error).split())[:200]) from error
         read = _read_arrays(folder)
         if read.keys() != arrays.keys() or any(read[name].tobytes() != arrays[name].tobytes() for name in arrays):
             raise CheckpointDamagedError(f"checkpoint {folder} is damaged: what was written is not what is read")

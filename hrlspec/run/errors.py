@@ -8,6 +8,7 @@ traceback.
 from __future__ import annotations
 
 import errno
+import os
 import sys
 from collections.abc import Callable
 
@@ -15,6 +16,10 @@ from hrlspec.run.signals import INTERRUPTED, ended_by_signals
 from hrlspec.run.streams import lasting_streams
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
+_REFUSED = {
+    getattr(errno, name)
+    for name in ("EACCES", "EDQUOT", "EFBIG", "EIO", "ENAMETOOLONG", "ENOSPC", "EPERM", "EROFS", "ESTALE")
+}
 
 
 class UserError(Exception):
@@ -30,7 +35,8 @@ def main_guard(main: Callable[[], None]) -> int:
 
     `UserError`, `SpecError`, `SuiteError` and `CheckpointError` become one line on standard error and status 2;
     `Interrupted` becomes one and status 130. Where the work does not stop in order, Ctrl-C and SIGTERM end the process
-    with status 130. ``SystemExit``, which the parser of flags raises, passes through.
+    with status 130. What the system refuses, such as room on a disk that is full, becomes one line and status 1.
+    ``SystemExit``, which the parser of flags raises, passes through.
 
     Nothing that cannot be written stops the work. If it was a result it is said at the end, with status 1; a reader
     who left, as in ``... | head``, has what it wants.
@@ -41,6 +47,9 @@ def main_guard(main: Callable[[], None]) -> int:
         except Interrupted as stop:
             return _say(f"interrupted: {stop}", INTERRUPTED)
         except Exception as error:
+            if isinstance(error, OSError) and error.errno in _REFUSED:
+                place = f"{os.fsdecode(error.filename)}: " if error.filename else ""
+                return _say(f"error: {place}{error.strerror}", FAILED)
             if not isinstance(error, _expected()):
                 raise
             return _say(f"error: {error}", BAD_INPUT)

@@ -7,9 +7,10 @@ host's work between two iterations costs the device nothing.
 from __future__ import annotations
 
 import collections
+import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol
 
 import jax
@@ -27,6 +28,10 @@ PATIENCE = 20  # iterations in a row with skipped updates before the run is give
 
 class DivergedError(Exception):
     """Training has gone where no update can bring it back from. The message says what was seen and what was saved."""
+
+
+class UnsavedError(Exception):
+    """The run folder cannot be written. The message says why and what was saved before."""
 
 
 class Display(Protocol):
@@ -138,6 +143,7 @@ class Loop:
         Raises:
             Interrupted: SIGINT or SIGTERM came after the first iteration; a checkpoint was written.
             DivergedError: updates were skipped for too long, or parameters are not finite.
+            UnsavedError: a row or a checkpoint cannot be written.
         """
         with polled_signals(f"--resume continues from what is in {self._folder.path}") as stop:
             stop.patient = False  # while the first iteration compiles, nothing has been done
@@ -202,7 +208,7 @@ class Loop:
             if self._skipping >= PATIENCE:
                 raise DivergedError(
                     f"losses or gradients were not finite in {PATIENCE} iterations in a row, up to environment step "
-                    f"{env_steps}; {self._what_is_left()}"
+                    f"{env_steps}; {self._what_is_left()}; try a smaller learning rate"
                 )
 
     def _evaluate(self, state: State) -> None:
@@ -217,21 +223,34 @@ class Loop:
             "train/steps_per_s": round(at.timed * job.steps_per_iteration / at.training, 1) if at.timed else None,
         }
         at.iterations, at.sums, at.timed, at.training = 0, {}, 0, 0.0
-        self._folder.append(row)
+        with self._refusals_told():
+            self._folder.append(row)
         self._display.row(row)
 
     def _save(self, state: State) -> None:
         self._check(state)  # what is damaged must not replace what is not
         metadata = {"config_hash": self._folder.config_hash, "position": dataclasses.asdict(self._at)}
-        checkpoint.save(self._folder.checkpoints, self._env_steps, state, metadata=metadata)
+        with self._refusals_told():
+            checkpoint.save(self._folder.checkpoints, self._env_steps, state, metadata=metadata)
+
+    @contextlib.contextmanager
+    def _refusals_told(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, checkpoint.CheckpointDamagedError) as error:
+            reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+            raise UnsavedError(
+                f"cannot write to {self._folder.path} at environment step {self._env_steps}: {reason}; "
+                f"{self._what_is_left()}; --resume goes on from there"
+            ) from error
 
     def _check(self, state: State) -> None:
         if not self._job.healthy(state):
             raise DivergedError(
-                f"parameters are not finite at environment step {self._env_steps}; {self._what_is_left()}"
+                f"parameters are not finite at environment step {self._env_steps}; {self._what_is_left()}; "
+                "try a smaller learning rate"
             )
 
     def _what_is_left(self) -> str:
         known = checkpoint.steps(self._folder.checkpoints)
-        what = f"the last checkpoint, in {self._folder.path}, is of step {known[-1]}" if known else "nothing was saved"
-        return f"{what}; try a smaller learning rate"
+        return f"the last checkpoint, in {self._folder.path}, is of step {known[-1]}" if known else "nothing was saved"

@@ -28,6 +28,8 @@ def raising(error: BaseException):
     [
         (UserError("no such\n  folder"), 2, "error: no such folder\n"),
         (CheckpointMissingError("no checkpoint in x"), 2, "error: no checkpoint in x\n"),
+        (OSError(28, "No space left on device"), 1, "error: No space left on device\n"),
+        (PermissionError(13, "Permission denied", "there"), 1, "error: there: Permission denied\n"),
         (Interrupted("checkpoint of step 5 written"), 130, "interrupted: checkpoint of step 5 written\n"),
     ],
 )
@@ -53,7 +55,7 @@ def test_success_is_silent(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("error", [ZeroDivisionError(), SystemExit(2)])
+@pytest.mark.parametrize("error", [ZeroDivisionError(), FileNotFoundError(2, "No such file"), SystemExit(2)])
 def test_bugs_and_exits_pass_through(error: BaseException) -> None:
     with pytest.raises(type(error)):
         main_guard(raising(error))

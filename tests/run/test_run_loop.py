@@ -17,8 +17,8 @@ import pytest
 from hrlspec import checkpoint
 from hrlspec.checkpoint import state_hash
 from hrlspec.run.errors import Interrupted
-from hrlspec.run.folder import open_run, read_metrics
-from hrlspec.run.loop import PATIENCE, DivergedError, Job, Loop
+from hrlspec.run.folder import RunFolder, open_run, read_metrics
+from hrlspec.run.loop import PATIENCE, DivergedError, Job, Loop, UnsavedError
 
 STEPS, ITERATIONS, EVERY = 8, 13, 20
 
@@ -233,6 +233,27 @@ def test_a_finished_run_becomes_longer(tmp_path: Path, reference: tuple[Path, st
             state = it.train(it.restore())
     assert state_hash(state) == reference[1]
     assert [row["env_steps"] for row in read_metrics(tmp_path)] == [24, 40, 56, 64, 72, 80, 104]
+
+
+@pytest.mark.parametrize("what", ["row", "checkpoint"])
+def test_a_full_disk_ends_the_run_and_costs_no_more_than_the_last_steps(
+    tmp_path: Path, reference: tuple[Path, str, list[float]], monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    def full(*args: Any, **kwargs: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    def fill() -> None:
+        monkeypatch.setattr(*((RunFolder, "append", full) if what == "row" else (checkpoint, "save", full)))
+
+    with pytest.raises(UnsavedError) as error:
+        train(tmp_path, toy(), Recorder(4, fill), seconds=0)
+    message = str(error.value)
+    assert message.startswith(f"cannot write to {tmp_path} at environment step ")
+    assert ": No space left on device; the last checkpoint, in " in message
+    assert message.endswith("--resume goes on from there")
+    monkeypatch.undo()
+    assert state_hash(train(tmp_path, toy(), resume=True)) == reference[1]
+    assert timeless(tmp_path) == timeless(reference[0])
 
 
 def skipping(first: int, last: int) -> Callable[[Any, int], Any]:

@@ -29,7 +29,7 @@ from hrlspec.run.folder import (
     read_summary,
 )
 from hrlspec.run.learner import Learner
-from hrlspec.run.loop import DivergedError, Loop
+from hrlspec.run.loop import DivergedError, Loop, UnsavedError
 from hrlspec.run.progress import ProgressDisplay, duration
 from hrlspec.run.run_flags import RunFlags, experiments_of, parse_run, schedules_moved
 from hrlspec.run.signals import ended_by_signals
@@ -123,7 +123,7 @@ def _run(experiment: Experiment, folder: Path, resume: bool, flags: RunFlags, co
                 display.note(_continuing(experiment, before, loop.position.done))
             try:
                 state = loop.train(state)
-            except DivergedError as error:
+            except (DivergedError, UnsavedError) as error:
                 raise SystemExit(f"error: {error}") from None
         wall = loop.position.wall
         console.say(f"{experiment.name}: trained in {duration(wall)}; evaluating")
