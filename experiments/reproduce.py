@@ -25,10 +25,10 @@ from experiments.paper.panels import (
 )
 from experiments.paper.records import read_records, record_of
 from hrlspec.presets import RECIPES
-from hrlspec.run.checkout import check_checkout
 from hrlspec.run.cli import call
 from hrlspec.run.console import PlainConsole
 from hrlspec.run.errors import UserError
+from hrlspec.run.extras import check_drawing
 from hrlspec.run.flags import parse_flags
 
 
@@ -47,12 +47,12 @@ class ReproduceFlags:
     """Environment steps of each run; 1.5 M in Letter, 2 M in Walk and 4 M in Zone if not given."""
     jobs: int | None = None
     """Runs side by side; one for each accelerator or CPU core if not given."""
-    out: Path = Path("results/paper")
-    """Records and figures."""
-    report: Path = Path("docs/results.md")
-    """What they say."""
-    work: Path = Path("runs/paper")
-    """Run folders with their checkpoints."""
+    out: Path | None = None
+    """Records and figures; in the checkout results/paper if not given."""
+    report: Path | None = None
+    """What they say; results.md in --out if not given, or without it docs/results.md."""
+    work: Path | None = None
+    """Run folders with their checkpoints; runs in --out if not given, or without it runs/paper."""
     dry_run: bool = False
     """Only say what would be run."""
     draw_only: bool = False
@@ -67,40 +67,75 @@ def main(argv: Sequence[str], *, program: str = "hrlspec reproduce") -> None:
         program: what to call it in messages.
 
     Raises:
-        UserError: bad usage, no checkout, or a damaged folder or file of records.
+        UserError: bad usage, a missing library, or a damaged folder or file of records.
         Interrupted: stopped by a signal; the runs have saved what they did.
     """
     flags = parse_flags(ReproduceFlags, argv, program=program)
     _check(flags)
-    check_checkout("reproduce")
+    places = _places(flags)
+    if not flags.dry_run:
+        check_drawing()
     console = PlainConsole(stderr=True)
     panels = [panel for name, panel in (PANELS | TUNING).items() if name in (flags.only or PANELS)]
     runs = _runs(panels, flags)
-    known = read_records(runs, flags.out)
+    known = read_records(runs, places.out)
     missing = [run for run in runs if run not in known]
-    shown, picture = trajectory_run(flags.steps), flags.out / f"{TRAJECTORIES}.png"
+    shown, picture = trajectory_run(flags.steps), places.out / f"{TRAJECTORIES}.png"
     to_draw = (not flags.only or TRAJECTORIES in flags.only) and not picture.exists()
-    if to_draw and shown not in missing and record_of(flags.work / shown.name) is None:
+    if to_draw and shown not in missing and record_of(places.work / shown.name) is None:
         missing.append(shown)  # its checkpoint is gone, or it is of no panel asked for
     console.say(f"{len({*runs, *missing})} runs, {len(missing)} of them missing")
     if flags.dry_run:
         for run in missing:
-            print(" ".join(command(run, flags.work)[1:]))
+            print(" ".join(command(run, places.work)[1:]))
         return
     if not flags.draw_only:
         if missing:
-            make(missing, work=flags.work, records=flags.out, jobs=flags.jobs, console=console)
+            make(missing, work=places.work, records=places.out, jobs=flags.jobs, console=console)
         if to_draw:
-            _draw_trajectories(flags.work / shown.name, picture)
+            _draw_trajectories(places.work / shown.name, picture)
             console.say(f"written: {picture}")
     # The drawing library is an extra, and takes a second to load.
     from experiments.paper.report import write_report
 
     # The page is about all that is known, whatever was asked for now.
     everything = dataclasses.replace(flags, recipes=RECIPES, seeds=max(flags.seeds, NUM_SEEDS))
-    records = read_records(_runs([*PANELS.values(), *TUNING.values()], everything), flags.out)
-    for file in write_report(panels, records, flags.out, flags.report):
+    records = read_records(_runs([*PANELS.values(), *TUNING.values()], everything), places.out)
+    for file in write_report(panels, records, places.out, places.report):
         console.say(f"written: {file}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Places:
+    """Where everything is.
+
+    Attributes:
+        out: records and figures.
+        report: the page.
+        work: run folders.
+    """
+
+    out: Path
+    report: Path
+    work: Path
+
+
+def _places(flags: ReproduceFlags) -> Places:
+    """The project's own records and page belong to its checkout; elsewhere nothing is written where nobody said.
+
+    Raises:
+        UserError: this is no checkout and --out is missing.
+    """
+    if flags.out is not None:
+        default = Places(flags.out, flags.out / "results.md", flags.out / "runs")
+    elif Path().resolve() == Path(__file__).resolve().parents[1]:
+        default = Places(Path("results/paper"), Path("docs/results.md"), Path("runs/paper"))
+    else:
+        raise UserError(
+            f"{Path().resolve()} is not the checkout that this program is of, whose records and page it would renew: "
+            "run it there, or give --out"
+        )
+    return Places(default.out, flags.report or default.report, flags.work or default.work)
 
 
 def _check(flags: ReproduceFlags) -> None:

@@ -209,10 +209,31 @@ def test_bad_input(flags: str, message: str, tmp_path: Path, monkeypatch: pytest
     assert not list(tmp_path.iterdir())
 
 
-def test_only_a_checkout_has_records_to_work_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_elsewhere_it_writes_where_it_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where everything looks like a checkout."""
+    page = tmp_path / "docs" / "results.md"
+    for file in (page, tmp_path / "results" / "paper" / "mine", tmp_path / "experiments" / "reproduce.py"):
+        file.parent.mkdir(parents=True)
+        file.write_text("mine")
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(UserError, match=r"has no experiments/reproduce\.py: clone the repository and run reproduce in"):
+    before = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*")}
+    with pytest.raises(UserError, match=r"is not the checkout .* or give --out"):
         reproduce.main(["--draw-only"])
+    assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*")} == before
+    add_record(PANELS["walk-set1"].runs(1, None)[0], record([0.5], 0.5), Path("here"))
+    reproduce.main(["--draw-only", "--out", "here"])
+    made = {file for file in tmp_path.rglob("*") if file not in before}
+    assert {file.relative_to(tmp_path).parts[0] for file in made} == {"here"}
+    assert "| walk-set1 | 1 runs" in (tmp_path / "here" / "results.md").read_text()
+    assert page.read_text() == "mine"
+
+
+def test_the_drawing_library_is_asked_for_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.delitem(sys.modules, "hrlspec.run.plots", raising=False)
+    monkeypatch.setattr(reproduce, "make", lambda *args, **kwargs: pytest.fail("a run was made"))
+    with pytest.raises(UserError, match=r'no pictures without the extra "plot": pip install "hrlspec\[plot\]"'):
+        reproduce.main(["--out", str(tmp_path)])
     assert not list(tmp_path.iterdir())
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import io
 
 import pytest
-from rich.console import Console
 
 from hrlspec.run import progress
+from hrlspec.run.console import PlainConsole
 from hrlspec.run.progress import ProgressDisplay, duration
 
 
@@ -21,7 +21,7 @@ class Clock:
 
 def test_plain_lines_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, stream = Clock(monkeypatch), io.StringIO()
-    with ProgressDisplay(10_000, "run", console=Console(file=stream, width=20)) as display:
+    with ProgressDisplay(10_000, "run", console=PlainConsole(file=stream, width=20)) as display:
         clock.now += 60  # compilation
         display.advance(1000, {"episodes": 10.0, "successes": 5.0, "level": 1.0})
         clock.now += 10
@@ -39,7 +39,7 @@ def test_plain_lines_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_evaluations_do_not_slow_the_rate_down(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, stream = Clock(monkeypatch), io.StringIO()
-    with ProgressDisplay(10_000, "run", console=Console(file=stream, width=200), begin=5000) as display:
+    with ProgressDisplay(10_000, "run", console=PlainConsole(file=stream, width=200), begin=5000) as display:
         display.advance(5100, {})
         display.row({"env_steps": 5100})
         clock.now += 1000  # the evaluation
@@ -51,13 +51,28 @@ def test_evaluations_do_not_slow_the_rate_down(monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_bar_in_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, stream = Clock(monkeypatch), io.StringIO()
-    console = Console(file=stream, width=120, force_terminal=True, color_system=None)
+    console = PlainConsole(file=stream, width=120, force_terminal=True, color_system=None)
     with ProgressDisplay(1000, "run", console=console) as display:
         display.advance(100, {"episodes": 4.0, "successes": 3.0, "level": 3.0})
         clock.now += 1
         display.advance(200, {"episodes": 4.0, "successes": 3.0, "level": 3.0})
     assert "200/1,000 steps, 100 steps/s, level 3, success 0.75" in stream.getvalue()
     assert "0:08 left" in stream.getvalue()
+
+
+@pytest.mark.parametrize("terminal", ["xterm", "dumb"])
+def test_names_are_shown_as_they_are(terminal: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, stream, name = Clock(monkeypatch), io.StringIO(), "exp[test] [bold red]x :smile:"
+    environ = {"TERM": terminal}
+    console = PlainConsole(file=stream, width=120, force_terminal=True, color_system=None, _environ=environ)
+    with ProgressDisplay(1000, name, console=console) as display:
+        clock.now += 60
+        display.advance(100, {})
+        display.note("[/] closed")
+    assert f"{name}: [/] closed" in stream.getvalue()
+    assert f"{name}: 100/1,000 steps" in stream.getvalue() or terminal == "xterm"
+    assert ("\x1b" in stream.getvalue()) == (terminal == "xterm")  # the bar
+    assert "\x1b[?25l" not in stream.getvalue()  # a hidden cursor would stay so where the process ends at once
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(0, "0:00"), (59.6, "1:00"), (3599, "59:59"), (3723, "1:02:03")])
