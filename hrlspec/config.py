@@ -39,8 +39,15 @@ class Checked:
                 raise ConfigError(f"{type(self).__name__}.{field.name} is {found!r}, expected {_words(hint)}")
             for value in found if isinstance(found, tuple) else (found,):
                 if isinstance(value, int | float) and not least <= value <= most:
-                    bounds = f"at least {least:g}" if most == math.inf else f"a number from {least:g} to {most:.10g}"
+                    bounds = (
+                        f"at least {least:g}" if most == math.inf else f"a number from {least:g} to {_plainly(most)}"
+                    )
                     raise ConfigError(f"{type(self).__name__}.{field.name} is {found}, expected {bounds}")
+
+
+def _plainly(number: float) -> str:
+    """Whole numbers with all of their digits."""
+    return str(number) if isinstance(number, int) else f"{number:g}"
 
 
 def _fits(value: Any, hint: Any) -> bool:
@@ -89,7 +96,7 @@ class NetworkConfig(Checked):
     reach_critic: tuple[int, ...] = setting((64, 64), least=1)
     """Hidden units of the critic behind the shield."""
     roles: bool = False
-    """Task-conditioned encoding: the low level sees the observation by role (the goal p₊, the forbidden p₋, what comes
+    """Task-conditioned encoding: the low level sees the observation by role (the goal p+, the forbidden p-, what comes
     1, 2, ... sub-tasks later) instead of by name. Off encodes the observation without the task, as in the paper."""
     names: bool = False
     """Whether the low level sees the observation by role and by name: where rewards depend on propositions that have no
@@ -198,7 +205,7 @@ class ShieldConfig(Checked):
     enabled: bool = True
     """Whether actions near a forbidden proposition are replaced while collecting."""
     threshold: float = setting(0.9, least=0, most=1)
-    """ν: V(s, g) above it counts as near."""
+    """Nu: V(s, g) above it counts as near."""
     discount: float = setting(0.85, least=0, most=1)
     """Discount of the reach critic: its value is discount^(steps to g - 1)."""
     optimiser: OptimiserConfig = OptimiserConfig(final_learning_rate=1e-3, epochs=1, minibatches=8, max_grad_norm=1.0)
@@ -214,7 +221,7 @@ class Config(Checked):
     """T, steps of a rollout."""
     total_steps: int = setting(3_000_000, least=1, most=2**40)
     discount: float = setting(0.94, least=0, most=1)
-    """γ, per environment step, at both levels."""
+    """Gamma, per environment step, at both levels."""
     noise_correlation: float = setting(0.0, least=0, most=0.999)
     """Correlation of the noise of successive steps while collecting, for continuous actions: coloured noise explores
     farther than white noise, whose steps cancel out."""

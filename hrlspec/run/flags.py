@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from hrlspec.config import ConfigError
 from hrlspec.run.errors import UserError
@@ -19,6 +20,8 @@ Flags = TypeVar("Flags")
 
 _ELSEWHERE = re.compile(r"(gs|s3):|[A-Za-z][\w+.-]+:/")  # pathlib makes one slash of two
 _SETTING = re.compile(r"(?:Error parsing (\S+): )?([A-Z]\w*)\.([\w.]+)(?= is )")
+_NO_TYPE = re.compile(r"no type matching (\S+) could be instantiated from \[(.*)\]\.?")
+_WORDS = {"INT": "a whole number", "FLOAT": "a number", "PATH": "a path"}
 
 
 def parse_flags(
@@ -42,7 +45,7 @@ def parse_flags(
         options["default"] = default
     said = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(said), _kinds():
             parsed: Flags = tyro.cli(flags, description=about, **options)
     except SystemExit as stop:
         if not stop.code:
@@ -54,6 +57,35 @@ def parse_flags(
                 f"{flag_of(name)} is {value}, expected a path on this machine; storage elsewhere has to be mounted"
             )
     return parsed
+
+
+def _kinds() -> ConstructorRegistry:
+    """How values are read where the parser's own way would not do."""
+    kinds = ConstructorRegistry()
+
+    @kinds.primitive_rule
+    def whole_numbers(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | None:
+        if kind.type is not int:
+            return None
+        return PrimitiveConstructorSpec(
+            nargs=1,
+            metavar="INT",
+            instance_from_str=lambda words: _whole_number(words[0]),
+            is_instance=lambda value: type(value) is int,
+            str_from_instance=lambda value: [str(value)],
+        )
+
+    return kinds
+
+
+def _whole_number(text: str) -> int:
+    """The number, which may be written with an exponent: ``1e6``."""
+    with contextlib.suppress(ValueError):
+        return int(text)
+    with contextlib.suppress(ValueError):
+        if (value := float(text)).is_integer():
+            return int(value)
+    raise ValueError(f"found {text!r}, expected a whole number")
 
 
 def in_flags(message: str | ConfigError, flags: Any) -> str:
@@ -105,4 +137,11 @@ def _reason(text: str) -> str:
             blocks.append([])
     said = [" ".join(block) for block in blocks if block]
     title = 0 if "╭" in text else 1  # a framed title stands in the frame
-    return said[title] if len(said) > title else "the arguments cannot be understood"
+    if len(said) <= title:
+        return "the arguments cannot be understood"
+    return _NO_TYPE.sub(lambda match: f"found {match[2]}, expected {_in_words(match[1])}", said[title])
+
+
+def _in_words(types: str) -> str:
+    """Alternatives such as ``{None}|INT``; nobody types what stands for no value."""
+    return " or ".join(_WORDS.get(name, name) for name in types.split("|") if name != "{None}")

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import jax
 
-from hrlspec.run.errors import UserError
+from hrlspec.run.errors import UserError, in_words
 
 _OPTIONS = "--xla_backend_extra_options="
 # The CPU backend folds the body of a small loop into one kernel, which makes rollouts several times faster. Up to JAX
@@ -39,7 +39,7 @@ def prepare() -> None:
     What the user set in ``XLA_FLAGS``, ``JAX_COMPILATION_CACHE_DIR`` and JAX's other variables stays as it is.
 
     Raises:
-        UserError: XLA would end the process because of its flags.
+        UserError: XLA would end the process because of its flags, or there is no device to compute on.
     """
     _keep_freed_memory()
     flags = _flags_of_user(os.environ.get("XLA_FLAGS", ""))
@@ -51,6 +51,12 @@ def prepare() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     # A cache that cannot be read or written costs time and nothing else.
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
+    try:
+        jax.devices()
+    except Exception as error:  # what is raised differs from backend to backend
+        platforms = os.environ.get("JAX_PLATFORMS")
+        asked = f" with JAX_PLATFORMS={platforms}; without it JAX chooses" if platforms else ""
+        raise UserError(f"JAX finds no device to compute on{asked} ({in_words(error)})") from error
 
 
 @functools.cache

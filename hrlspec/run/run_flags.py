@@ -42,7 +42,7 @@ class RunFlags(Checked):
     seed: int = setting(0, least=0, most=_LAST_SEED)
     num_seeds: int = setting(1, least=1)
     """Seeds to run one after another, from --seed on, each in a folder of its own."""
-    total_steps: int | None = setting(None, least=1)
+    total_steps: int | None = setting(None, least=1, most=2**40)
     """Environment steps; the preset's if not given."""
     out: Path | None = None
     """The run folder; runs/<name> if not given. With several seeds, the folder that holds seed<n>/."""

@@ -30,6 +30,8 @@ BAD_FLAGS: list[tuple[Sequence[str], str]] = [
     (("--run", "foreign", "--suite", "dag", "--step", "5"), "no checkpoint of step 5"),
     (("--run", "run", "--suite", "cats"), "unknown suite 'cats' of 'letter'"),
     (("--run", "run", "--suite", "dag", "--draw", "way.gif"), "--draw way.gif: expected a file that ends in .png"),
+    (("--run", "run", "--suite", "dag", "--draw", "folder.png"), "--draw folder.png: expected a file, found a folder"),
+    (("--run", "run", "--suite", "dag", "--draw", "file/x.png"), "cannot write to file: "),
     (("--run", "run", "--spec", ""), "found no formula"),
     (("--run", "run", "--spec", "achieve"), "line 1, column 8"),
     (("--run", "run", "--spec", "achieve a ;; b"), "column 12"),
@@ -63,6 +65,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
             pass
     checkpoint.save(folder / "foreign" / "checkpoints", 3, {"params": {"planner": jnp.zeros(2)}})
     (folder / "damaged").mkdir()
+    (folder / "folder.png").mkdir()
     (folder / "damaged" / "config.json").write_text("{")
     (folder / "file").write_text("x")
     (folder / "binary").write_bytes(b"\xff\xfe\x00")

@@ -22,7 +22,7 @@ from PIL import Image
 
 from hrlspec import checkpoint
 from hrlspec.checkpoint import state_hash
-from hrlspec.run import signals
+from hrlspec.run import plots, signals
 from hrlspec.run.commands import evaluate, run
 from hrlspec.run.errors import main_guard
 from hrlspec.run.experiment import experiment_of
@@ -296,6 +296,31 @@ def test_evaluate_prints_one_json_object(finished: Path, tmp_path: Path, capsys:
     assert json.loads(capsys.readouterr().out) == report  # seeded
     assert main_guard(lambda: evaluate.main([*flags, "--seed", "1"])) == 0
     assert json.loads(capsys.readouterr().out)["per_task"] != report["per_task"]
+
+
+def test_what_cannot_be_drawn_costs_one_line(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The results are there; a run whose pictures are missing without a reason is ended again."""
+
+    def no_latex(*args: Any) -> Any:
+        raise RuntimeError("latex could not be found:\n[/] see the log")
+
+    folder = tmp_path / "run [bold red]"
+    shutil.copytree(finished, folder)
+    summary = json.loads((folder / "summary.json").read_text())
+    (folder / "summary.json").write_text(json.dumps({name: summary[name] for name in summary if name != "pictures"}))
+    monkeypatch.setattr(plots, "examples", no_latex)
+    monkeypatch.setattr(plots, "episodes_of", no_latex)
+    assert call(*tiny.arguments(folder, "--resume")) == 0
+    said = "no picture: RuntimeError: latex could not be found: [/] see the log"
+    assert capsys.readouterr().out.splitlines()[-2:] == [said, f"results, curves and pictures: {folder}"]
+    assert json.loads((folder / "summary.json").read_text()) == summary | {"pictures": ["plots/curves.png"]}
+    flags = ["--run", str(folder), "--spec", LARGE, "--episodes", "20", "--json", "--draw", str(tmp_path / "x.png")]
+    assert main_guard(lambda: evaluate.main(flags)) == 2
+    out, err = capsys.readouterr()
+    assert json.loads(out)["episodes"] == 20
+    assert err == f"error: {said}\n"
 
 
 def test_evaluate_prints_a_table(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:

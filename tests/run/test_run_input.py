@@ -41,8 +41,14 @@ BAD_FLAGS = [
     ("--seed 99999999999", "--seed is 99999999999"),
     ("--num-seeds 0", "--num-seeds is 0, expected at least 1"),
     ("--seed 2147483647 --num-seeds 2", "--num-seeds is 2, expected the last seed to be at most 2147483647"),
-    ("--total-steps 0", "--total-steps is 0, expected at least 1"),
-    ("--total-steps many", "--total-steps"),
+    ("--total-steps 0", "--total-steps is 0, expected a number from 1 to"),
+    ("--total-steps many", "--total-steps: found 'many', expected a whole number"),
+    ("--total-steps 1.5e0", "--total-steps: found '1.5e0', expected a whole number"),
+    (
+        "--total-steps 10000000000000000000",
+        "--total-steps is 10000000000000000000, expected a number from 1 to 109951162",
+    ),
+    ("--env [bold]zone", "unknown environment '[bold]zone'"),
     ("--total-steps -5", "total-steps is -5"),
     ("--checkpoint-minutes -1", "--checkpoint-minutes is -1"),
     ("--checkpoint-minutes nan", "--checkpoint-minutes is nan"),
@@ -197,6 +203,8 @@ def test_switches_and_overrides() -> None:
     assert made("--no-max-operator", "--recipe", "paper").method_settings.high.max_operator is False
     assert made("--no-transe") == changed({}, {"transe": 0.0})
     assert made("--no-relabel") == changed({"relabel.share": 0.0}, {}) == made("--config.relabel.share", "0")
+    assert made("--total-steps", "1e6") == made("--total-steps", "1000000")
+    assert made("--evaluation.every", "5E4").evaluation.every == 50_000
     assert made("--total-steps", "7") == changed({"total_steps": 7}, {}) == made("--config.total-steps", "7")
     assert made("--method.high.transe-margin", "3") == changed({}, {"transe_margin": 3.0})
     curriculum = made("--no-curriculum").config.curriculum

@@ -16,6 +16,7 @@ import pytest
 
 from hrlspec import checkpoint
 from hrlspec.checkpoint import state_hash
+from hrlspec.run import signals
 from hrlspec.run.errors import Interrupted
 from hrlspec.run.folder import RunFolder, open_run, read_metrics
 from hrlspec.run.loop import PATIENCE, DivergedError, Job, Loop, UnsavedError
@@ -158,6 +159,22 @@ def test_a_stopped_run_goes_on_as_if_nothing_had_happened(
     assert display.losses + again.losses == reference[2]
     assert state_hash(state) == reference[1]
     assert timeless(tmp_path) == timeless(reference[0])
+
+
+def test_before_the_first_iteration_is_compiled_there_is_nothing_to_wait_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+
+    def iterate(state: Any, index: int) -> Any:
+        if index == 0:
+            stop()
+        return step(state, index)
+
+    monkeypatch.setattr(signals, "_end", said.append)
+    with pytest.raises(Interrupted):  # the process would be gone
+        train(tmp_path, toy(iterate=iterate))
+    assert said == [f"--resume continues from what is in {tmp_path}"]
 
 
 def test_a_signal_during_an_evaluation_waits_for_its_row(

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from hrlspec.evaluation import Aggregate, ChoiceResult, ReturnResult, Score, SuiteResult, TaskScore
 from hrlspec.evaluation.stats import Interval
+from hrlspec.run.console import PlainConsole
 from hrlspec.run.learner import FinalResults
 from hrlspec.run.tables import aggregate_table, final_tables, suite_table
 
@@ -69,6 +70,12 @@ def test_it_says_what_intervals_are_over() -> None:
     ]
     assert "depth 3* " in texts[1]
     assert "95 % intervals over the episodes, given these tasks;" in texts[2]
+
+
+def test_names_are_shown_as_they_are() -> None:
+    stream = io.StringIO()
+    PlainConsole(file=stream, width=80).print(suite_table(dataclasses.replace(result(), suite="[bold red]x[/] :eye:")))
+    assert "Unseen tasks: [bold red]x[/] :eye: (2 tasks" in stream.getvalue()
 
 
 def test_bounds_lose_their_leading_zero_alone() -> None:

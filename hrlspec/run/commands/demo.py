@@ -51,7 +51,7 @@ class DemoFlags(Checked):
     world: tyro.conf.Positional[Literal["rooms", "dilemma"]]
     """rooms: a key to think of; dilemma: a reward to do without."""
     seed: int = setting(0, least=0, most=2**31 - 1)
-    steps: int | None = setting(None, least=1)
+    steps: int | None = setting(None, least=1, most=2**40)
     """Environment steps of each method; 0.6 M in rooms and 1 M in dilemma if not given."""
     out: Path = Path("runs")
     """Folder for the picture."""
