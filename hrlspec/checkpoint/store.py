@@ -230,13 +230,18 @@ def _write(folder: Path, leaves: Mapping[str, Leaf], metadata: Mapping[str, Any]
         if isinstance(leaf.value, np.ndarray) and leaf.value.size
     }
     if arrays:
+        _check_room(folder, sum(array.nbytes for array in arrays.values()))
         with _orbax(folder) as (_, checkpointer, path):
             try:
                 checkpointer.save(path, arrays)
             except Exception as error:  # the storage's own, of several types
                 if isinstance(error, OSError):
                     raise
-                raise OSError(errno.EIO, " ".join(str(error).split())[:200]) from error
+                said = " ".join(str(error).split())
+                number = re.search(r"os_error_code='(\d+)'", said)
+                if number:
+                    raise OSError(int(number[1]), os.strerror(int(number[1]))) from error
+                raise OSError(errno.EIO, said[:200]) from error
         read = _read_arrays(folder)
         if read.keys() != arrays.keys() or any(read[name].tobytes() != arrays[name].tobytes() for name in arrays):
             raise CheckpointDamagedError(f"checkpoint {folder} is damaged: what was written is not what is read")
@@ -251,6 +256,14 @@ def _write(folder: Path, leaves: Mapping[str, Leaf], metadata: Mapping[str, Any]
     (folder / _SEAL).write_bytes(_seal(text))
     for path in (folder / _MANIFEST, folder / _SEAL, folder):
         _flush(path)
+
+
+def _check_room(folder: Path, size: int) -> None:
+    """Raises the system's error if there is not enough room: threads of the storage would tell of theirs at length."""
+    if not hasattr(os, "posix_fallocate"):
+        return
+    with tempfile.TemporaryFile(dir=folder) as file:
+        os.posix_fallocate(file.fileno(), 0, 2 * size + 2**20)
 
 
 def _entry(path: str, leaf: Leaf) -> dict[str, Any]:

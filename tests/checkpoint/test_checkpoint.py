@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import os
@@ -325,21 +326,24 @@ def test_what_cannot_be_read_back_replaces_nothing(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such limits")
-def test_a_disk_that_is_full_is_an_error_of_the_system(tmp_path: Path) -> None:
+@pytest.mark.parametrize("noticed", ["before", "while writing"])
+def test_a_disk_that_is_full_is_an_error_of_the_system(tmp_path: Path, noticed: str) -> None:
     """A limit on the size of files stands for the disk; it is for good, so it is set in a process of its own."""
     script = (
         "import resource, sys, numpy as np\n"
-        "from hrlspec.checkpoint import load, save\n"
+        "from hrlspec.checkpoint import load, save, store\n"
+        "if sys.argv[2] != 'before':\n"
+        "    store._check_room = lambda folder, size: None\n"
         "small, large = {'w': np.zeros(10)}, {'w': np.random.default_rng(0).random(100_000)}\n"
         "save(sys.argv[1], 1, small)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))\n"
         "try:\n"
         "    save(sys.argv[1], 2, large)\n"
-        "except OSError:\n"
-        "    print(load(sys.argv[1], small).step)\n"
+        "except OSError as error:\n"
+        "    print(load(sys.argv[1], small).step, error.strerror)\n"
     )
     ended = subprocess.run(
-        [sys.executable, "-c", script, str(tmp_path)],
+        [sys.executable, "-c", script, str(tmp_path), noticed],
         capture_output=True,
         text=True,
         timeout=120,
@@ -347,7 +351,7 @@ def test_a_disk_that_is_full_is_an_error_of_the_system(tmp_path: Path) -> None:
         env=dict(os.environ, JAX_PLATFORMS="cpu"),
         cwd=Path(__file__).parents[2],
     )
-    assert (ended.stdout, ended.stderr, ended.returncode) == ("1\n", "", 0)
+    assert (ended.stdout, ended.stderr, ended.returncode) == (f"1 {os.strerror(errno.EFBIG)}\n", "", 0)
     assert [entry.name for entry in tmp_path.iterdir()] == ["step_000000000001"]
 
 
