@@ -47,7 +47,7 @@ class Checked:
 
 def _plainly(number: float) -> str:
     """Whole numbers with all of their digits."""
-    return str(number) if isinstance(number, int) else f"{number:g}"
+    return str(number) if isinstance(number, int) else f"{number:.10g}"
 
 
 def _fits(value: Any, hint: Any) -> bool:

@@ -47,7 +47,7 @@ def make(runs: Sequence[Run], *, work: Path, records: Path, jobs: int | None, co
             while waiting and free:
                 run, place = waiting.pop(0), free.pop()
                 running[run] = _start(run, work, place), place
-            time.sleep(POLL_SECONDS)
+            stop.wait(POLL_SECONDS)
             for run in [run for run, (process, _) in running.items() if process.poll() is not None]:
                 process, place = running.pop(run)
                 free.append(place)

@@ -40,12 +40,17 @@ def parse_flags(
         UserError: a flag is unknown or its value is not allowed; the message says why.
         SystemExit: with status 0, after ``--help`` was printed.
     """
-    options: dict[str, Any] = {"args": list(argv), "prog": program, "config": (tyro.conf.FlagCreatePairsOff,)}
+    options: dict[str, Any] = {
+        "args": list(argv),
+        "prog": program,
+        "config": (tyro.conf.FlagCreatePairsOff,),
+        "registry": _kinds(),
+    }
     if default is not None:
         options["default"] = default
     said = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said), _kinds():
+        with contextlib.redirect_stderr(said):
             parsed: Flags = tyro.cli(flags, description=about, **options)
     except SystemExit as stop:
         if not stop.code:

@@ -32,9 +32,19 @@ class StopRequest:
     def __init__(self) -> None:
         self.signal_name: str | None = None
         self.patient = True
+        self._asked = threading.Event()
 
     def __bool__(self) -> bool:
         return self.signal_name is not None
+
+    def ask(self, signal_name: str) -> None:
+        """Asks the process to stop."""
+        self.signal_name = signal_name
+        self._asked.set()
+
+    def wait(self, seconds: float) -> None:
+        """Sleeps until asked, at most so long."""
+        self._asked.wait(seconds)
 
 
 @contextlib.contextmanager
@@ -68,7 +78,7 @@ def polled_signals(how_to_go_on: str = "") -> Iterator[StopRequest]:
     def hear(name: str) -> None:
         if stop or not stop.patient:
             _end(how_to_go_on)
-        stop.signal_name = name
+        stop.ask(name)
 
     with _heard(hear):
         yield stop

@@ -30,6 +30,7 @@ def test_the_first_signal_sets_the_flag_and_the_second_does_not_wait(number: sig
         os.kill(os.getpid(), number)
         assert stop
         assert stop.signal_name == number.name
+        stop.wait(1e6)
         assert not ends
         os.kill(os.getpid(), number)
         assert ends == ["go on"]
