@@ -423,6 +423,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--from", dest="first", type=int, default=0, help="the first that is carried out")
     parser.add_argument("--work", type=Path, help="where; a temporary folder by default")
     flags = parser.parse_args(argv)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that processes and disks are put away
     storm = Storm((flags.work or Path(tempfile.mkdtemp(prefix="storm-"))).absolute(), flags.seed)
     disks = "small ones" if storm.mounts else "limits on files"
     print(f"an undisturbed run takes {storm.seconds:.1f} s; disks are {disks}", flush=True)
