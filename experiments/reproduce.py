@@ -30,6 +30,7 @@ from hrlspec.run.console import PlainConsole
 from hrlspec.run.errors import UserError
 from hrlspec.run.extras import check_drawing
 from hrlspec.run.flags import parse_flags
+from hrlspec.run.signals import leave
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,4 +168,4 @@ def _draw_trajectories(folder: Path, file: Path) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(call("reproduce", program="python -m experiments.reproduce"))
+    leave(call("reproduce", program="python -m experiments.reproduce"))

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-
 from hrlspec.run.cli import call
+from hrlspec.run.signals import leave
 
 if __name__ == "__main__":
-    sys.exit(call("run", program="python -m experiments.run"))
+    leave(call("run", program="python -m experiments.run"))

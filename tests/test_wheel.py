@@ -58,7 +58,7 @@ def test_what_is_inside(wheel: Path) -> None:
     for preset in PRESETS.values():
         files = {f"{name}.txt" for name in preset.suites} | {"reserved.hex"}
         assert {f"hrlspec/presets/suites/{preset.name}/{file}" for file in files} <= names
-    assert "hrlspec = hrlspec.run.cli:main" in entry_points
+    assert "hrlspec = hrlspec.run.cli:console" in entry_points
     modules = {
         str(file.relative_to(ROOT)) for package in ("hrlspec", "envs_jax") for file in (ROOT / package).rglob("*.py")
     }

@@ -8,9 +8,11 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable, Sequence
+from typing import NoReturn
 
 from hrlspec.run.checkout import check_checkout
 from hrlspec.run.errors import UserError, main_guard
+from hrlspec.run.signals import leave
 from hrlspec.version import __version__
 
 COMMANDS = {
@@ -82,5 +84,10 @@ def _command(name: str) -> Callable[..., None]:
     return command
 
 
+def console() -> NoReturn:
+    """The process ``hrlspec``."""
+    leave(main())
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    console()

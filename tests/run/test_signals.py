@@ -93,3 +93,16 @@ def test_another_thread_gets_a_flag_that_stays_unset() -> None:
     thread.join()
     assert seen == [False]
     assert [signal.getsignal(number) for number in SIGNALS] == before
+
+
+LEAVING = """
+import atexit, os, signal, time
+from hrlspec.run.signals import leave
+atexit.register(lambda: (os.kill(os.getpid(), signal.SIGINT), time.sleep(100)))
+leave(0)
+"""
+
+
+def test_nothing_is_raised_while_the_interpreter_clears_up() -> None:
+    ended = subprocess.run([sys.executable, "-c", LEAVING], capture_output=True, text=True, timeout=60, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (-signal.SIGINT, "", "")
