@@ -48,11 +48,11 @@ class ImplicitPlanner(Checked, HighLevel):
     """Whether the policy learns from relabelled copies; value and transition model always do. In a copy the branch
     taken was not chosen by the planner, and always succeeded."""
     steps_per_sample: int = setting(16, least=1)
-    """The planner trains on at most E·T divided by this many decisions per iteration."""
+    """The planner trains on at most E x T divided by this many decisions per iteration."""
     transe: float = setting(0.01, least=0, most=1e6)
-    """λ, the weight of the TransE loss."""
+    """Lambda, the weight of the TransE loss."""
     transe_margin: float = setting(1.0, least=0, most=1e6)
-    """ξ, the margin of the TransE loss."""
+    """Xi, the margin of the TransE loss."""
     advised: int = setting(12, least=1)
     """Paths to a leaf that are valued for the advice; edges without one count as the worst of these."""
 
