@@ -2,9 +2,9 @@
 
 python -m benchmarks.reference_hashes [--only letter/hrlspec ...] [--record]
 
-One line a run; exit status 1 if one differs. The record was made at the commits it names, one a recipe, with the versions
-and compiler options it names: without fused multiply-adds, so that the way in which XLA groups operations does not
-show. Where a commit had other names for the parts of the parameters, ``names`` in the record maps them. A change of
+One line a run; exit status 1 if one differs. The record was made at the commits it names, one a recipe, with the
+versions and compiler options it names: without fused multiply-adds, so that the way in which XLA groups operations does
+not show. Where a commit had other names for the parts of the parameters, ``names`` in the record maps them. A change of
 arithmetic that is meant is followed by ``--record``, in a commit of its own.
 """
 
