@@ -100,7 +100,8 @@ class Corridor(Environment):
         return Discrete(n=2)
 
     def sample_layout(self, key: jax.Array, params: EnvParams) -> CorridorLayout:
-        return CorridorLayout(jax.random.choice(key, jnp.asarray(self.starts, jnp.int32)))
+        drawn = jax.random.randint(key, (), 0, len(self.starts), jnp.int32)
+        return CorridorLayout(jnp.asarray(self.starts, jnp.int32)[drawn])
 
     def resample_layout(self, key: jax.Array, layout: Any, needed: jax.Array, params: EnvParams) -> CorridorLayout:
         return jax.tree.map(lambda new, old: jnp.where(needed, new, old), self.sample_layout(key, params), layout)

@@ -48,7 +48,7 @@ def most_contested(
 ) -> tuple[Int32[Array, ""], Int32[Array, ""]]:
     """The pair of letters with the largest regret among ``tries`` random ones, int32 ``[]`` each. Consumes the key."""
     num_letters = regret.shape[0]
-    chance = jax.random.uniform(key, (2, tries))
+    chance = jax.random.uniform(key, (2, tries), jnp.float32)
     first = (chance[0] * num_letters).astype(jnp.int32)
     second = (first + 1 + (chance[1] * (num_letters - 1)).astype(jnp.int32)) % num_letters
     best = jnp.argmax(regret[first, second])

@@ -168,7 +168,7 @@ class Letter(Symmetric, FiniteGraph, ContestedLayouts, Drawable):
         if self.num_letters < 2:
             return layout
         pair = most_contested(pair_key, myopia_regret(layout, self.num_letters), CONTESTED_TRIES)
-        name = jnp.arange(self.num_letters)
+        name = jnp.arange(self.num_letters, dtype=jnp.int32)
         for found, wanted in zip(pair, (jnp.argmax(first), jnp.argmax(second)), strict=True):
             found = name[found]  # it may have been renamed by the first exchange
             name = jnp.where(name == found, wanted, jnp.where(name == wanted, found, name))
@@ -231,7 +231,7 @@ class Letter(Symmetric, FiniteGraph, ContestedLayouts, Drawable):
     def labels(self, state: LetterState, params: EnvParams) -> Bool[Array, " P"]:
         """The letter of the agent's cell, bool ``[P]``, at most one of them true."""
         del params
-        return state.layout[state.position[0], state.position[1]] == jnp.arange(self.num_letters)
+        return state.layout[state.position[0], state.position[1]] == jnp.arange(self.num_letters, dtype=jnp.int32)
 
     def observation(self, state: LetterState, params: EnvParams) -> Float32[Array, "..."]:
         """The grid around the agent, float32 ``[n, n, P + 1]``."""
@@ -268,7 +268,7 @@ class Letter(Symmetric, FiniteGraph, ContestedLayouts, Drawable):
             ``row * n + column``.
         """
         del params
-        labels = jnp.asarray(layout).reshape(-1, 1) == jnp.arange(self.num_letters)
+        labels = jnp.asarray(layout).reshape(-1, 1) == jnp.arange(self.num_letters, dtype=jnp.int32)
         return jnp.asarray(_successors(self.size)), labels, jnp.int32(0)
 
     def graph_state(self, state: LetterState) -> Int32[Array, ""]:
@@ -296,7 +296,9 @@ class Letter(Symmetric, FiniteGraph, ContestedLayouts, Drawable):
         drawn = (jax.random.bits(key, index.shape, jnp.uint32) & ~low_bits) | index
         rank = (drawn[None, :] < drawn[:, None]).sum(-1, dtype=jnp.int32)
         letter = jnp.where(rank < self.num_cells, rank // (self.num_cells // self.num_letters), NO_LETTER)
-        return jnp.concatenate([jnp.full(1, NO_LETTER), letter]).reshape(self.size, self.size).astype(jnp.int8)
+        return (
+            jnp.concatenate([jnp.full(1, NO_LETTER, jnp.int32), letter]).reshape(self.size, self.size).astype(jnp.int8)
+        )
 
     def _all_reachable(self, layout: Int[Array, "n n"]) -> Bool[Array, ""]:
         """Whether each letter has a cell next to those reachable from (0, 0) over letter-free cells, bool ``[]``."""

@@ -65,8 +65,8 @@ class Rooms(Drawable):
     def sample_layout(self, key: Key[Array, ""], params: EnvParams) -> RoomsLayout:
         """Uniform cells in their rooms; the key at the far wall, on no direct way from the start to the door."""
         del params
-        rows = jax.random.randint(key, (4,), 0, ROOM)
-        columns = jax.random.randint(jax.random.fold_in(key, 1), (4,), jnp.array([1, 0, 0, 0]), ROOM)
+        rows = jax.random.randint(key, (4,), 0, ROOM, jnp.int32)
+        columns = jax.random.randint(jax.random.fold_in(key, 1), (4,), jnp.array([1, 0, 0, 0]), ROOM, jnp.int32)
         columns = columns.at[1].set(0) + (ROOM + 1) * np.array([0, 0, 1, 2])
         return RoomsLayout(*jnp.stack([rows, columns], -1).astype(jnp.int32))
 

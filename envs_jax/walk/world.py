@@ -225,7 +225,7 @@ class Walk(GridMap, Drawable):
     ) -> StepResult:
         """One step; see :meth:`Environment.step_env`."""
         del key
-        moved = state.position + jnp.float32(self.step_size) * jnp.clip(action, -1.0, 1.0)
+        moved = state.position + jnp.float32(self.step_size) * jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0)
         position = jnp.clip(moved, self.low, self.high)
         state = WalkState(position=position, layout=state.layout, time=state.time + 1)
         out = (moved[0] != position[0]) | (moved[1] != position[1]) if self.ends_outside else jnp.bool_(False)

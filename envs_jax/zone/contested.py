@@ -81,14 +81,14 @@ def contested_layout(
         return key, core, rest, found & placed
 
     heading_key, key = jax.random.split(key)
-    heading = jax.random.uniform(heading_key, (), maxval=2 * jnp.pi)
-    nowhere = jnp.zeros(2)
-    start = (key, _Core(nowhere, nowhere, nowhere, nowhere), jnp.zeros((_REST, 2)), ~jnp.bool_(needed))
+    heading = jax.random.uniform(heading_key, (), jnp.float32, maxval=2 * jnp.pi)
+    nowhere = jnp.zeros(2, jnp.float32)
+    start = (key, _Core(nowhere, nowhere, nowhere, nowhere), jnp.zeros((_REST, 2), jnp.float32), ~jnp.bool_(needed))
     _, core, rest, _ = jax.lax.while_loop(lambda carry: ~carry[3], attempt, start)
 
     pair = jnp.stack([core.better, core.nearer])
     reflected = 2 * core.robot - pair[::-1]
-    index = jnp.arange(len(COLOURS))
+    index = jnp.arange(len(COLOURS), dtype=jnp.int32)
     other = (index != first) & (index != second)
     zones = rest[1:].reshape(-1, ZONES_EACH, 2)[jnp.clip(jnp.cumsum(other) - 1, 0, 1)]
     zones = jnp.where((index == first)[:, None, None], jnp.where(mirrored, reflected, pair), zones)
@@ -99,7 +99,7 @@ def contested_layout(
 def _draw_core(key: Key[Array, ""]) -> tuple[_Core, Bool[Array, ""]]:
     """Robot, goal and the two zones of the first colour, and whether a valid draw was found (bool ``[]``)."""
     # All numbers in one draw, for one call of the generator: it is what drawing a layout costs.
-    unit = jax.random.uniform(key, (_GEOMETRIES, 7))
+    unit = jax.random.uniform(key, (_GEOMETRIES, 7), jnp.float32)
 
     def between(column: int, limits: tuple[float, float]) -> Float[Array, "..."]:
         return limits[0] + (limits[1] - limits[0]) * unit[:, column]
@@ -132,7 +132,7 @@ def _draw_rest(key: Key[Array, ""], core: _Core) -> tuple[Float[Array, "..."], B
     """
     near, far = _reflected(core)
     core_zones = jnp.stack([core.goal, core.better, core.nearer, near, far])
-    draws = jax.random.uniform(key, (_REST, MOST_DRAWS, 2), minval=-_REACH, maxval=_REACH)
+    draws = jax.random.uniform(key, (_REST, MOST_DRAWS, 2), jnp.float32, minval=-_REACH, maxval=_REACH)
 
     def place(
         placed: Float[Array, "objects 2"], inputs: tuple[Array, Array]
@@ -146,8 +146,8 @@ def _draw_rest(key: Key[Array, ""], core: _Core) -> tuple[Float[Array, "..."], B
         found = candidates[jnp.argmax(free)]
         return jnp.where((np.arange(_REST) == index)[:, None], found, placed), (found, free.any())
 
-    nothing = jnp.full((_REST, 2), _NOWHERE)
-    _, (rest, found) = jax.lax.scan(place, nothing, (jnp.arange(_REST), draws))
+    nothing = jnp.full((_REST, 2), _NOWHERE, jnp.float32)
+    _, (rest, found) = jax.lax.scan(place, nothing, (jnp.arange(_REST, dtype=jnp.int32), draws))
     return rest, found.all()
 
 

@@ -35,8 +35,8 @@ class ZoneLayout:
     """A layout of Zone.
 
     Attributes:
-        robot: float ``[3]``, where the robot starts: x, y (m), heading (rad).
-        zones: float ``[P, Z, 2]``, centres of the zones (m).
+        robot: float32 ``[3]``, where the robot starts: x, y (m), heading (rad).
+        zones: float32 ``[P, Z, 2]``, centres of the zones (m).
     """
 
     robot: Float[Array, "*lead 3"]
@@ -63,18 +63,17 @@ def new_layout(key: Key[Array, ""], layout: ZoneLayout, needed: Bool[Array, ""])
     layouts, and that costs nothing where nothing is needed. The loop has no limit: a layout takes more than k attempts
     with probability 0.025^k.
     """
-    dtype = jnp.result_type(float)
     heading_key, key = jax.random.split(key)
-    heading = jax.random.uniform(heading_key, (), dtype, 0.0, 2 * jnp.pi)
-    previous = jnp.concatenate([layout.robot[None, :2], layout.zones.reshape(-1, 2)]).astype(dtype)
-    nothing = jnp.full((1 + NUM_ZONES, 2), _NOWHERE, dtype)
+    heading = jax.random.uniform(heading_key, (), jnp.float32, 0.0, 2 * jnp.pi)
+    previous = jnp.concatenate([layout.robot[None, :2], layout.zones.reshape(-1, 2)]).astype(jnp.float32)
+    nothing = jnp.full((1 + NUM_ZONES, 2), _NOWHERE, jnp.float32)
     start = _Draw(key=key, placed=nothing, count=jnp.int32(0), draws=jnp.int32(0), done=~needed)
     drawn = jax.lax.while_loop(lambda draw: ~draw.done, lambda draw: _place_next(draw, previous), start)
     fresh = ZoneLayout(
         robot=jnp.concatenate([drawn.placed[0], heading[None]]),
         zones=drawn.placed[1:].reshape(len(COLOURS), ZONES_EACH, 2),
     )
-    return jax.tree.map(lambda new, old: jnp.where(needed, new, old.astype(dtype)), fresh, layout)
+    return jax.tree.map(lambda new, old: jnp.where(needed, new, old.astype(jnp.float32)), fresh, layout)
 
 
 def _place_next(draw: _Draw, previous: Float[Array, "objects 2"]) -> _Draw:
@@ -83,12 +82,13 @@ def _place_next(draw: _Draw, previous: Float[Array, "objects 2"]) -> _Draw:
     key, draw_key = jax.random.split(draw.key)
     is_robot = draw.count == 0
     reach = jnp.where(is_robot, SPAWN - ROBOT_KEEPOUT, SPAWN - ZONE_KEEPOUT)
-    candidates = reach * jax.random.uniform(draw_key, (_BLOCK, 2), draw.placed.dtype, -1.0, 1.0)
+    candidates = reach * jax.random.uniform(draw_key, (_BLOCK, 2), jnp.float32, -1.0, 1.0)
     # The robot comes first, so what is being placed near something else is always a zone.
     apart = np.where(index == 0, ROBOT_KEEPOUT + ZONE_KEEPOUT, 2 * ZONE_KEEPOUT)
+    least = (apart**2).astype(np.float32)
     dx = candidates[:, None, 0] - draw.placed[:, 0]
     dy = candidates[:, None, 1] - draw.placed[:, 1]
-    free = (dx * dx + dy * dy >= apart**2).all(-1)
+    free = (dx * dx + dy * dy >= least).all(-1)
     found = free.any()
     place = candidates[jnp.argmax(free)]
     placed = jnp.where(((index == draw.count) & found)[:, None], place, draw.placed)

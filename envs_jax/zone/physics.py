@@ -20,6 +20,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend import core
 
 from envs_jax.zone.scalarize import CannotScalarizeError, scalarize
 
@@ -159,9 +160,8 @@ def import_mjx() -> tuple[Any, Any]:
 @functools.cache
 def _mjx_model(walls: bool, x64: bool) -> tuple[Any, Any]:
     """The MJX model and its initial data, in single or double precision."""
-    del x64  # part of the cache's key
     mujoco, mjx = import_mjx()
-    with jax.ensure_compile_time_eval():
+    with jax.enable_x64(x64), jax.ensure_compile_time_eval():
         native = mujoco.MjModel.from_xml_string(model_xml(walls=walls))
         model = mjx.put_model(native, impl="jax")
         return model, mjx.make_data(model, impl="jax")
@@ -187,17 +187,23 @@ def _mjx_programs(walls: bool, scalarized: bool, x64: bool) -> tuple[Program, Pr
             data = mjx.sensor_acc(model, data)
         return data.sensordata
 
-    if not scalarized:
-        return substep, sensors
     dtype = jnp.float64 if x64 else jnp.float32
     examples = (jax.ShapeDtypeStruct((6,), dtype), jax.ShapeDtypeStruct((2,), dtype))
-    try:
-        return scalarize(substep, *examples), scalarize(sensors, *examples)
-    except CannotScalarizeError as error:
-        warnings.warn(
-            f"Zone runs MJX as it is, which is slower: it now holds what is not known ({error})", stacklevel=2
-        )
-        return substep, sensors
+    # MJX makes arrays of the default type, so it is traced here and not where its caller may have chosen another one.
+    with jax.enable_x64(x64):
+        if scalarized:
+            try:
+                return scalarize(substep, *examples), scalarize(sensors, *examples)
+            except CannotScalarizeError as error:
+                warnings.warn(
+                    f"Zone runs MJX as it is, which is slower: it now holds what is not known ({error})", stacklevel=2
+                )
+        return _traced(substep, *examples), _traced(sensors, *examples)
+
+
+def _traced(function: Program, *examples: Any) -> Program:
+    program = core.jaxpr_as_fun(jax.make_jaxpr(function)(*examples))
+    return lambda *arguments: program(*arguments)[0]
 
 
 def _mjx_step(walls: bool, scalarized: bool, body: jax.Array, control: jax.Array) -> tuple[jax.Array, jax.Array]:

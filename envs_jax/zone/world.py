@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Bool, Float, Int32, Key, Shaped
+from jaxtyping import Bool, Float, Float32, Int32, Key, Shaped
 
 from envs_jax.arrays import Array
 from envs_jax.base import Box, ContestedChoice, Drawable, EnvParams, Reflections, StepResult, Symmetric
@@ -35,18 +35,18 @@ SENSOR_SCALE = np.repeat(np.array([0.1, 1.0, 0.3, 2.0], np.float32), 3)
 
 @struct.dataclass
 class ZoneState:
-    """A running episode; floats are float32 unless JAX runs with 64 bits.
+    """A running episode.
 
     Attributes:
-        body: float ``[6]``: x, y (m), heading (rad, not wrapped), their velocities.
-        sensors: float ``[12]``, the robot's last readings.
+        body: float32 ``[6]``: x, y (m), heading (rad, not wrapped), their velocities.
+        sensors: float32 ``[12]``, the robot's last readings.
         vanished: bool ``[P]``, colours that are gone for the rest of the episode.
         layout: where it takes place.
         time: int32 ``[]``, steps taken.
     """
 
-    body: Float[Array, "*lead 6"]
-    sensors: Float[Array, "*lead 12"]
+    body: Float32[Array, "*lead 6"]
+    sensors: Float32[Array, "*lead 12"]
     vanished: Bool[Array, "*lead P"]
     layout: ZoneLayout
     time: Int32[Array, "*lead"]
@@ -219,10 +219,10 @@ class Zone(Symmetric, ContestedChoice, Drawable):
 
     def reset_to(
         self, layout: ZoneLayout, key: Key[Array, ""], params: EnvParams
-    ) -> tuple[Float[Array, "..."], ZoneState]:
+    ) -> tuple[Float32[Array, "..."], ZoneState]:
         """Starts at rest in a given layout."""
         del key
-        layout = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), layout)
+        layout = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), layout)
         state = ZoneState(
             body=jnp.concatenate([layout.robot, jnp.zeros(3, layout.robot.dtype)]),
             sensors=zone_physics.at_rest(layout.robot[2]),
@@ -257,13 +257,13 @@ class Zone(Symmetric, ContestedChoice, Drawable):
         del params
         return self._touched(state.body, state.layout.zones) & ~state.vanished
 
-    def observation(self, state: ZoneState, params: EnvParams) -> Float[Array, "..."]:
-        """Sensors, lidar and, without solid walls, the wall sensor: float ``[80]`` or ``[76]``."""
+    def observation(self, state: ZoneState, params: EnvParams) -> Float32[Array, "..."]:
+        """Sensors, lidar and, without solid walls, the wall sensor: float32 ``[80]`` or ``[76]``."""
         del params
         lidar = jnp.where(state.vanished[:, None], 0.0, lidar_readings(state.body, state.layout.zones, self.gain))
         parts = [state.sensors, lidar.reshape(-1)]
         if not self.walls:
-            sides = np.array([BOUNDARY, -BOUNDARY, -BOUNDARY, BOUNDARY])
+            sides = np.array([BOUNDARY, -BOUNDARY, -BOUNDARY, BOUNDARY], np.float32)
             parts.append(jnp.exp(-jnp.abs(state.body[np.array([0, 1, 0, 1])] - sides)))
         return jnp.concatenate(parts)
 
@@ -331,8 +331,7 @@ def _tuples(rows: Any) -> tuple[tuple[Any, ...], ...]:
 
 def _no_layout() -> ZoneLayout:
     """Like no layout that is ever drawn."""
-    dtype = jnp.result_type(float)
-    return ZoneLayout(robot=jnp.zeros(3, dtype), zones=jnp.zeros((len(COLOURS), ZONES_EACH, 2), dtype))
+    return ZoneLayout(robot=jnp.zeros(3, jnp.float32), zones=jnp.zeros((len(COLOURS), ZONES_EACH, 2), jnp.float32))
 
 
 PRESETS = {

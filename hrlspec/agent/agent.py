@@ -54,7 +54,7 @@ class Agent:
 
     def init(self, key: Key[Array, ""]) -> Params:
         """Fresh parameters of all parts: ``low``, ``high`` and ``reach_critic``. The key is consumed."""
-        view = view_of(self.env, jnp.zeros(self.env.observation_shape))
+        view = view_of(self.env, jnp.zeros(self.env.observation_shape, jnp.float32))
         tree = _blank_tree(self.env.num_propositions)
         low = self.low.controller.init(key, view, tree, method="everything")
         high = self.high.init(key, self.low, view, tree)

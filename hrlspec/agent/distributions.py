@@ -7,11 +7,11 @@ mode. Axes: **A** actions, or components of an action; **K** candidate actions.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from envs_jax import Box, Discrete
 
@@ -80,7 +80,7 @@ class Categorical:
 
     def noise(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
         """See :class:`Distribution`."""
-        return jax.random.gumbel(key, (*shape, self.num_actions))
+        return jax.random.gumbel(key, (*shape, self.num_actions), jnp.float32)
 
     def noise_sequence(self, key: jax.Array, length: int, correlation: jax.Array | float) -> jax.Array:
         """See :class:`Distribution`; never correlated."""
@@ -136,7 +136,7 @@ class DiagonalGaussian:
 
     def noise(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
         """See :class:`Distribution`."""
-        return jax.random.normal(key, (*shape, self.size))
+        return jax.random.normal(key, (*shape, self.size), jnp.float32)
 
     def noise_sequence(self, key: jax.Array, length: int, correlation: jax.Array | float) -> jax.Array:
         """See :class:`Distribution`: a stationary first-order autoregression, standard normal at every step."""
@@ -159,21 +159,21 @@ class DiagonalGaussian:
         """See :class:`Distribution`."""
         mean, log_std = self._moments(outputs)
         z = (action - mean) * jnp.exp(-log_std)
-        return -(0.5 * z**2 + log_std + 0.5 * np.log(2 * np.pi)).sum()
+        return -(0.5 * z**2 + log_std + 0.5 * math.log(2 * math.pi)).sum()
 
     def entropy(self, outputs: jax.Array) -> jax.Array:
         """See :class:`Distribution`."""
-        return (self._moments(outputs)[1] + 0.5 * np.log(2 * np.pi * np.e)).sum()
+        return (self._moments(outputs)[1] + 0.5 * math.log(2 * math.pi * math.e)).sum()
 
     def candidates(self) -> jax.Array:
         """A grid over the box, corners included, float32 ``[K, A]``."""
-        side = jnp.linspace(self.low, self.high, self.candidates_per_side)
+        side = jnp.linspace(self.low, self.high, self.candidates_per_side, dtype=jnp.float32)
         return jnp.stack(jnp.meshgrid(*[side] * self.size, indexing="ij"), -1).reshape(-1, self.size)
 
     def _moments(self, outputs: jax.Array) -> tuple[jax.Array, jax.Array]:
         half, middle = (self.high - self.low) / 2, (self.high + self.low) / 2
         mean, raw = MOST_MEAN * jnp.tanh(outputs[: self.size] / MOST_MEAN), outputs[self.size :]
-        return middle + half * mean, jnp.clip(raw, LEAST_LOG_STD, MOST_LOG_STD) + np.log(half)
+        return middle + half * mean, jnp.clip(raw, LEAST_LOG_STD, MOST_LOG_STD) + math.log(half)
 
 
 def distribution_over(space: Discrete | Box) -> Distribution:

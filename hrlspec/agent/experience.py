@@ -92,14 +92,14 @@ def view_of(env: Environment, observation: Float32[Array, "..."]) -> View:
 
 def undecided(num_envs: int, num_nodes: int, ahead_shape: tuple[int, ...]) -> HighDecision:
     """Nothing assigned yet, leading axis E; ``ahead_shape`` is ``(D, P)``."""
-    nothing = jnp.zeros(num_envs)
+    nothing = jnp.zeros(num_envs, jnp.float32)
     return HighDecision(
         made=jnp.zeros(num_envs, bool),
         edge=jnp.full(num_envs, TaskTree.NO_NODE, jnp.int32),
-        ahead=jnp.zeros((num_envs, *ahead_shape)),
+        ahead=jnp.zeros((num_envs, *ahead_shape), jnp.float32),
         log_prob=nothing,
         value=nothing,
-        advice=jnp.zeros((num_envs, num_nodes)),
+        advice=jnp.zeros((num_envs, num_nodes), jnp.float32),
     )
 
 

@@ -104,7 +104,7 @@ def decide(
         tree, instructions = jax.tree.map(lambda x: x[task], (book.tree, book.instructions))
         choice = agent.high.choose(agent.low, params, view, tree, state, instructions)
         edge, log_prob = jax.vmap(Categorical(noise.shape[-1]).sample)(choice.logits, noise)
-        ahead = choice.ahead[jnp.arange(edge.shape[0]), edge]
+        ahead = choice.ahead[jnp.arange(edge.shape[0], dtype=jnp.int32), edge]
         return HighDecision(jnp.ones(edge.shape, bool), edge, ahead, log_prob, choice.value, choice.advice)
 
     before = worker.decision

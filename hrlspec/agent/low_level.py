@@ -108,8 +108,8 @@ class LowLevel:
         if self.sees != "whole task":
             return dataclasses.replace(jax.tree.map(lambda x: x[(*where, edge)], instructions), ahead=ahead)
         future = self.controller.apply(params["low"], instructions.future[where], feasible, method="remaining")
-        nothing = jnp.zeros((*edge.shape, instructions.reach.shape[-1]))
-        behind = jnp.zeros((*edge.shape, 0, instructions.reach.shape[-1]))
+        nothing = jnp.zeros((*edge.shape, instructions.reach.shape[-1]), jnp.float32)
+        behind = jnp.zeros((*edge.shape, 0, instructions.reach.shape[-1]), jnp.float32)
         return Instruction(reach=nothing, avoid=nothing, ahead=ahead, behind=behind, future=cast(Array, future))
 
     def control(
@@ -135,7 +135,7 @@ class LowLevel:
             edge: int32 ``[B]``.
             feasible: bool ``[B, N]``, the open edges.
         """
-        rows = jnp.arange(edge.shape[0])
+        rows = jnp.arange(edge.shape[0], dtype=jnp.int32)
         now = self.instructions_at(params, instructions, (rows,), edge, feasible, instructions.ahead[rows, edge])
         return jax.vmap(self.control, in_axes=(None, 0, 0))(params, view, now)[1]
 

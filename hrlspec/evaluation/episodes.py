@@ -134,14 +134,14 @@ def _run(
     env, book = agent.env, agent.low.prepare(params, trees)
     worker = start(jax.vmap(jax.random.fold_in, (None, 0))(key, rows), env, machine, book, layouts, rows)
     noise_scale = 0.0 if greedy else 1.0
-    zeros = jnp.zeros(num_episodes)
+    zeros = jnp.zeros(num_episodes, jnp.float32)
     outcome = Episodes(success=zeros > 0, violated=zeros > 0, steps=zeros.astype(jnp.int32), returns=zeros)
 
     def step(carry: tuple[Any, ...]) -> tuple[tuple[Any, ...], Trace]:
         worker, outcome, running, time = carry
         step_key, plan_key, act_key = jax.random.split(jax.random.fold_in(key, num_episodes + time), 3)
         worker = dataclasses.replace(worker, awaiting=worker.awaiting & running)
-        noise = noise_scale * jax.random.gumbel(plan_key, (num_episodes, num_nodes))
+        noise = noise_scale * jax.random.gumbel(plan_key, (num_episodes, num_nodes), jnp.float32)
         worker = assign(agent, params, book, worker, noise)
         noise = noise_scale * agent.low.actions.noise(act_key, (num_episodes,))
         action = act(agent, params, book, worker, noise, shield=shield).action

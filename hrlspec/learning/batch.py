@@ -57,13 +57,13 @@ def high_batch(key: Key[Array, ""], agent: Agent, x: Experience, settings: PPOCo
         *_in_time(outcome.reward, outcome.terminated, outcome.truncated, x.high.made, x.high.value, x.bootstrap.high),
         discount=agent.config.discount,
         # Choices of the task generator are no samples of the policy: their returns count with λ = 1.
-        gae_lambda=jnp.where(x.learns_high.T, settings.gae_lambda, 1.0),
+        gae_lambda=jnp.where(x.learns_high.T, jnp.float32(settings.gae_lambda), 1.0),
     )
     advantage = ppo.scaled(advantage.T, x.high.value, settings)
     num_rows, num_steps = x.high.made.shape
     last, completed = _endings(x)
     wanted = x.high.made & x.valid & (completed | agent.high.learns_unfinished)
-    lottery = jnp.where(wanted, jax.random.uniform(key, wanted.shape), -1.0).reshape(-1)
+    lottery = jnp.where(wanted, jax.random.uniform(key, wanted.shape, jnp.float32), -1.0).reshape(-1)
     size = min(agent.high.num_samples(agent.config), num_rows * num_steps)
     score, index = jax.lax.top_k(lottery, size)
     row, time = index // num_steps, index % num_steps
@@ -95,7 +95,7 @@ def _endings(x: Experience) -> tuple[Int32[Array, "V T"], Bool[Array, "V T"]]:
     """For each step the first at or after it that ends a sub-task, int32 ``[V, T]``, and whether it completed it."""
     num_steps = x.valid.shape[1]
     ended = x.outcome.edge_taken | x.outcome.terminated | x.outcome.truncated | jnp.roll(x.high.made, -1, 1)
-    end = jax.lax.cummin(jnp.where(ended, jnp.arange(num_steps), num_steps), axis=1, reverse=True)
+    end = jax.lax.cummin(jnp.where(ended, jnp.arange(num_steps, dtype=jnp.int32), num_steps), axis=1, reverse=True)
     last = jnp.minimum(end, num_steps - 1)
     return last, (end < num_steps) & jnp.take_along_axis(x.outcome.edge_taken, last, 1)
 
@@ -104,7 +104,7 @@ def _feasible(agent: Agent, x: Experience) -> Bool[Array, "V T _"]:
     """Open edges ``[V, T, N]`` where the low level is conditioned on them, else ``[V, T, 0]``."""
     if agent.method.sees != "whole task":
         return jnp.zeros((*x.slot.shape, 0), bool)
-    rows = jnp.arange(x.slot.shape[0])[:, None]
+    rows = jnp.arange(x.slot.shape[0], dtype=jnp.int32)[:, None]
     trees = jax.tree.map(lambda leaf: leaf[rows, x.slot], x.trees)
     return jax.vmap(jax.vmap(open_edges))(trees, x.state)
 

@@ -54,8 +54,8 @@ def gather(
     by_env = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), steps)
     parts = [originals(book, by_env, config.episode_slots)]
     if config.num_copies:
-        offset = jax.random.randint(key, (), 0, config.num_envs)
-        chosen = (offset + jnp.arange(config.num_copies)) % config.num_envs
+        offset = jax.random.randint(key, (), 0, config.num_envs, jnp.int32)
+        chosen = (offset + jnp.arange(config.num_copies, dtype=jnp.int32)) % config.num_envs
         keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, chosen)
         some = jax.tree.map(lambda x: x[chosen], by_env)
         parts.append(copies(keys, agent, params, machine, book, some, reserved))
@@ -65,7 +65,7 @@ def gather(
 
 def originals(book: TaskBook, rollout: Step, num_slots: int) -> Experience:
     """The rollout as it was, ``[E, T]``; episodes beyond the last slot are marked invalid."""
-    envs = jnp.arange(rollout.episode.shape[0])[:, None]
+    envs = jnp.arange(rollout.episode.shape[0], dtype=jnp.int32)[:, None]
     tasks = jnp.zeros((envs.shape[0], num_slots), jnp.int32)
     tasks = tasks.at[envs, rollout.episode].set(rollout.task, mode="drop")
     valid = rollout.episode < num_slots
@@ -135,7 +135,7 @@ def _estimates(
     PPO's ratio is taken to the probability with which an action was drawn, under the old task. A path was no choice of
     the high level: its ratio is taken to 1.
     """
-    row = (jnp.arange(slot.shape[0])[:, None] * new.tree.parent.shape[1] + slot).reshape(-1)
+    row = (jnp.arange(slot.shape[0], dtype=jnp.int32)[:, None] * new.tree.parent.shape[1] + slot).reshape(-1)
     fresh = agent.low.prepare(params, jax.tree.map(_flat, new.tree))
     view, edge, node = jax.tree.map(_flat, (rollout.view, new.assigned, new.node))
     instructions = _instructions(agent, params, fresh, row, edge, node, new)
@@ -214,7 +214,7 @@ def _instructions(
     )
     if agent.high.follows_plan and agent.method.sees == "future":
         # The plan of a relabelled task is the path that was completed; its nodes follow one another.
-        later = edge[:, None] + 1 + jnp.arange(instructions.ahead.shape[1])
+        later = edge[:, None] + 1 + jnp.arange(instructions.ahead.shape[1], dtype=jnp.int32)
         on_path = later <= new.path_length.reshape(-1)[row][:, None]
         ahead = tree.reach[row[:, None], jnp.minimum(later, tree.num_nodes - 1)] & on_path[..., None]
         instructions = dataclasses.replace(instructions, ahead=ahead.astype(jnp.float32))
@@ -238,7 +238,9 @@ def _judged(
         state = dataclasses.replace(jax.vmap(initial)(tree), node=node)
         return agent.high.judge(agent.low, params, view, tree, state, instructions)
 
-    unknown = Judgement(jnp.zeros(decided.shape), jnp.zeros((*decided.shape, fresh.tree.num_nodes)))
+    unknown = Judgement(
+        jnp.zeros(decided.shape, jnp.float32), jnp.zeros((*decided.shape, fresh.tree.num_nodes), jnp.float32)
+    )
     if agent.high.ppo is None:
         return unknown
     return in_groups(judge, decided, (view, row, node), unknown, JUDGED_AT_ONCE)

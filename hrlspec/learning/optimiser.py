@@ -44,7 +44,7 @@ def gradient_step(
     updates, new_state = transform.update(gradient, state, params)
     stepped = jax.tree.map(lambda p, u: p - learning_rate * u, params, updates)
     params, state = jax.tree.map(lambda new, old: jnp.where(finite, new, old), (stepped, new_state), (params, state))
-    return params, state, {**metrics, "grad_norm": norm, "skipped": 1.0 - finite}
+    return params, state, {**metrics, "grad_norm": norm, "skipped": (~finite).astype(jnp.float32)}
 
 
 def fit(
@@ -78,7 +78,7 @@ def fit(
         raise ValueError(f"{size} rows do not divide into {config.minibatches} minibatches")
     transform = optimiser(config)
     rate = annealed(config.learning_rate, config.final_learning_rate, progress)
-    shuffled = jnp.argsort(jax.random.bits(key, (config.epochs, size)), axis=-1)
+    shuffled = jnp.argsort(jax.random.bits(key, (config.epochs, size), jnp.uint32), axis=-1).astype(jnp.int32)
 
     def step(carry: tuple[Any, Any], rows: Int32[Array, " rows"]) -> tuple[tuple[Any, Any], Metrics]:
         sample = jax.tree.map(lambda x: x[rows], batch)

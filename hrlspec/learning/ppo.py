@@ -123,7 +123,7 @@ def low_level_loss(
     """
     own = {"low": params}
     instructions = jax.vmap(jax.vmap(low.instruct, in_axes=(None, 0)), in_axes=(None, 0))(own, batch.trees)
-    row = jnp.arange(batch.slot.shape[0])[:, None]
+    row = jnp.arange(batch.slot.shape[0], dtype=jnp.int32)[:, None]
     now = low.instructions_at(own, instructions, (row, batch.slot), batch.edge, batch.feasible, batch.ahead)
     view, instructions, decision, credit = jax.tree.map(flat, (batch.view, now, batch.decision, batch.credit))
     outputs, value = jax.vmap(low.control, in_axes=(None, 0, 0))(own, view, instructions)

@@ -86,7 +86,7 @@ def visits(record: Record) -> Record:
         seen = seen & ~first
         new = labels & ~seen
         intended = taken & (reach & new).any() & ~(avoid & (seen | labels)).any()
-        found = jnp.arange(labels.shape[0]) == jnp.argmax(new)
+        found = jnp.arange(labels.shape[0], dtype=jnp.int32) == jnp.argmax(new)
         goal = jnp.where(intended, reach, found) & new.any()
         return jnp.where(new.any(), labels, seen), (new.any(), goal, avoid & intended)
 
@@ -218,12 +218,12 @@ def _grow(
     shapes = ((2, max_path), (rounds, max_path, num_propositions), (num_places, num_propositions + 1))
     sizes = [math.prod(shape) for shape in shapes]
     # One draw for everything: each takes longer to compile than what is done with it.
-    drawn = jnp.split(jax.random.uniform(key, (sum(sizes),)), np.cumsum(sizes)[:-1])
+    drawn = jnp.split(jax.random.uniform(key, (sum(sizes),), jnp.float32), np.cumsum(sizes)[:-1])
     chance, lottery, noise = (x.reshape(shape) for x, shape in zip(drawn, shapes, strict=True))
 
     place = np.arange(max_path)
     grows = (chance[0] < branch) & (place < length)
-    limit = jnp.minimum(length - place, longest)
+    limit = jnp.minimum(length - place, longest).astype(jnp.int32)
     wanted = jnp.floor(chance[1] * limit).astype(jnp.int32) + 1
     wanted = jnp.where(grows, jnp.minimum(wanted, limit), 0)
 
@@ -251,7 +251,7 @@ def _grow(
         avoid=rows(nothing, path_avoid, avoid),
         accepting=rows(np.zeros(1, bool), place + 1 == length, ends),
         valid=valid,
-        depth=rows(np.zeros(1), place + 1, owner + 1 + offset).astype(jnp.int32),
+        depth=rows(np.zeros(1, np.int32), place + 1, owner + 1 + offset).astype(jnp.int32),
     )
 
 
@@ -273,7 +273,7 @@ def _branches(
     for j in range(lottery.shape[0]):
         exists = exists & (j < wanted) & ~excluded.all(-1)
         choice = jnp.argmax(jnp.where(excluded, -1.0, lottery[j]), -1)
-        goal = (jnp.arange(num_propositions) == choice[:, None]) & exists[:, None]
+        goal = (jnp.arange(num_propositions, dtype=jnp.int32) == choice[:, None]) & exists[:, None]
         reach.append(goal)
         alive.append(exists)
         forbidden.append(goal | before)

@@ -88,14 +88,14 @@ def fill_pool(key: Key[Array, ""], agent: Agent, book: TaskBook, level: Int32[Ar
 
     def one(index: Int32[Array, ""]) -> Pool:
         keys = jax.random.split(jax.random.fold_in(key, index), size + 1)
-        chance = jax.random.uniform(keys[size], (4, size))
+        chance = jax.random.uniform(keys[size], (4, size), jnp.float32)
         levels = curriculum.draw_levels(chance[:2], level, config.earlier)
         rows = (chance[2] * config.tasks_per_level).astype(jnp.int32)
         tasks = agent.config.num_envs + levels * config.tasks_per_level + rows
         layouts = jax.vmap(draw)(keys[:size], tasks, chance[3] < config.contested)
         return Pool(layout=layouts, task=tasks, level=levels)
 
-    return jax.vmap(one)(jnp.arange(agent.config.num_envs))
+    return jax.vmap(one)(jnp.arange(agent.config.num_envs, dtype=jnp.int32))
 
 
 def opening(tree: TaskTree) -> tuple[Bool[Array, " P"], Bool[Array, " P"]]:
@@ -121,10 +121,10 @@ def collect(
     agent, params, book = setting.agent, setting.params, setting.book
     num_envs, num_steps = agent.config.num_envs, agent.config.num_steps
     chance = _draw(key, agent, book.tree.num_nodes, correlation)
-    last = jnp.arange(num_steps) == num_steps - 1
+    last = jnp.arange(num_steps, dtype=jnp.int32) == num_steps - 1
     collector = dataclasses.replace(collector, started=jnp.zeros(num_envs, jnp.int32))
     collector, steps = jax.lax.scan(functools.partial(_step, setting), collector, (chance, last))
-    silence = jnp.zeros((num_envs, *agent.low.actions.noise_shape))
+    silence = jnp.zeros((num_envs, *agent.low.actions.noise_shape), jnp.float32)
     value = act(agent, params, book, collector.worker, silence, shield=False).value
     value = jnp.where(steps.outcome.truncated[-1], steps.bootstrap.low[-1], value)
     bootstrap = dataclasses.replace(steps.bootstrap, low=steps.bootstrap.low.at[-1].set(value))
@@ -138,12 +138,14 @@ def _draw(key: Key[Array, ""], agent: Agent, num_nodes: int, correlation: Float3
     def one(env: Int32[Array, ""]) -> _Chance:
         keys = jax.random.split(jax.random.fold_in(key, env), 3)
         return _Chance(
-            jax.random.gumbel(keys[0], (num_steps, num_nodes)),
+            jax.random.gumbel(keys[0], (num_steps, num_nodes), jnp.float32),
             agent.low.actions.noise_sequence(keys[1], num_steps, correlation),
             jax.random.split(keys[2], num_steps),
         )
 
-    chance: _Chance = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), jax.vmap(one)(jnp.arange(num_envs)))
+    chance: _Chance = jax.tree.map(
+        lambda x: jnp.swapaxes(x, 0, 1), jax.vmap(one)(jnp.arange(num_envs, dtype=jnp.int32))
+    )
     return chance
 
 
@@ -158,7 +160,7 @@ def _step(setting: Setting, collector: Collector, inputs: tuple[_Chance, Bool[Ar
     worker, outcome = transition(step_keys, agent.env, setting.machine, book, before, low.action)
     ended = outcome.terminated | outcome.truncated
     started = collector.started + ended
-    fresh = jax.tree.map(lambda x: x[jnp.arange(num_envs), started % pool.task.shape[1]], pool)
+    fresh = jax.tree.map(lambda x: x[jnp.arange(num_envs, dtype=jnp.int32), started % pool.task.shape[1]], pool)
     begun = start(reset_keys, agent.env, setting.machine, book, fresh.layout, fresh.task)
     after = where(ended, begun, worker)
     decision, bootstrap = _plan(setting, after, worker, outcome.truncated, last, chance.high)
@@ -173,7 +175,7 @@ def _step(setting: Setting, collector: Collector, inputs: tuple[_Chance, Bool[Ar
         low=low,
         outcome=outcome,
         bootstrap=Bootstrap(low=bootstrap, high=bootstrap),
-        reach_value=_reach_values(agent, params, worker.view) if shield else jnp.zeros((num_envs, 0)),
+        reach_value=_reach_values(agent, params, worker.view) if shield else jnp.zeros((num_envs, 0), jnp.float32),
     )
     collector = Collector(
         worker=dataclasses.replace(after, decision=decision, awaiting=jnp.zeros(num_envs, bool)),

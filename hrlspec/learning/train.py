@@ -74,7 +74,7 @@ class Trainer:
         self._check(bank)
         key, init_key, *start_keys = jax.random.split(key, 5)
         params = self.agent.init(init_key)
-        rows = jnp.arange(config.num_envs) % config.curriculum.tasks_per_level
+        rows = jnp.arange(config.num_envs, dtype=jnp.int32) % config.curriculum.tasks_per_level
         tasks = jax.tree.map(lambda x: jnp.asarray(x)[rows], bank)
         return TrainState(
             params=params,
@@ -130,7 +130,7 @@ class Trainer:
             key=state.key,
             iteration=state.iteration + 1,
         )
-        return new_state, losses | _summary(steps) | {"level": 1.0 + state.curriculum.level}
+        return new_state, losses | _summary(steps) | {"level": 1.0 + state.curriculum.level.astype(jnp.float32)}
 
     def _check(self, bank: TaskTree) -> None:
         """Raises ``AssertionError`` unless these are as many tasks of the size that the settings ask for."""
@@ -142,7 +142,7 @@ class Trainer:
     ) -> Collector:
         """Running episodes with staggered clocks; those that fail at first would otherwise all end in the same step."""
         agent, env = self.agent, self.agent.env
-        envs = jnp.arange(agent.config.num_envs)
+        envs = jnp.arange(agent.config.num_envs, dtype=jnp.int32)
         layout_key, reset_key, stagger_key = keys
 
         def each(key: Key[Array, ""]) -> Key[Array, " E"]:
@@ -150,7 +150,7 @@ class Trainer:
 
         layouts = jax.vmap(env.sample_layout, in_axes=(0, None))(each(layout_key), env.default_params)
         worker = start(each(reset_key), env, machine, agent.low.prepare(params, tasks), layouts, envs)
-        elapsed = jax.random.randint(stagger_key, envs.shape, 0, env.horizon)
+        elapsed = jax.random.randint(stagger_key, envs.shape, 0, env.horizon, jnp.int32)
         worker = dataclasses.replace(
             worker,
             env_state=dataclasses.replace(worker.env_state, time=elapsed.astype(jnp.int32)),
@@ -212,8 +212,8 @@ class Trainer:
         """The curriculum after the episodes of its level that ended in a rollout."""
         outcome = steps.outcome
         current = (outcome.terminated | outcome.truncated) & (steps.level == before.level)
-        succeeded = (current & outcome.satisfied).sum()
-        return curriculum.update(before, current.sum(), succeeded, self.agent.config.curriculum)
+        succeeded = (current & outcome.satisfied).sum(dtype=jnp.int32)
+        return curriculum.update(before, current.sum(dtype=jnp.int32), succeeded, self.agent.config.curriculum)
 
 
 def _summary(steps: Step) -> Metrics:

@@ -37,10 +37,10 @@ class NoChoice(Checked, HighLevel):
     ) -> Choice:
         """The root, which is no edge."""
         feasible = jax.vmap(open_edges)(tree, state)
-        root = jnp.arange(tree.num_nodes) == TaskTree.ROOT
-        logits = jnp.where(root, jnp.zeros(feasible.shape), MASKED)
-        value = low.value_of(params, view, instructions, logits.argmax(-1), feasible)
-        return Choice(logits, value, jnp.zeros(logits.shape), instructions.ahead)
+        root = jnp.arange(tree.num_nodes, dtype=jnp.int32) == TaskTree.ROOT
+        logits = jnp.where(root, jnp.zeros(feasible.shape, jnp.float32), MASKED)
+        value = low.value_of(params, view, instructions, logits.argmax(-1).astype(jnp.int32), feasible)
+        return Choice(logits, value, jnp.zeros(logits.shape, jnp.float32), instructions.ahead)
 
 
 @dataclasses.dataclass(frozen=True)

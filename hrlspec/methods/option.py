@@ -51,8 +51,8 @@ class Measurements:
 
 def unmeasured(num_propositions: int) -> Measurements:
     """One imagined attempt for each, which succeeded at once and earned nothing, so that all are tried."""
-    ones = jnp.ones((num_propositions + 1, num_propositions))
-    both = jnp.ones((2, num_propositions))
+    ones = jnp.ones((num_propositions + 1, num_propositions), jnp.float32)
+    both = jnp.ones((2, num_propositions), jnp.float32)
     return Measurements(attempts=ones, discounted=ones, successes=both, rewards=0 * both)
 
 
@@ -103,7 +103,7 @@ def measure(
 
 def origins(tree: TaskTree) -> Bool[Array, "N O"]:
     """Where a sub-task out of each node begins, bool ``[N, O]``: at what the node reached, or at the start."""
-    start = jnp.arange(tree.num_nodes) == TaskTree.ROOT
+    start = jnp.arange(tree.num_nodes, dtype=jnp.int32) == TaskTree.ROOT
     return jnp.concatenate([tree.reach, start[:, None]], -1)
 
 
@@ -128,7 +128,12 @@ def values(known: Measurements, tree: TaskTree, state: TaskState) -> Float32[Arr
         return best.at[tree.parent[node]].max(value), value
 
     # Children come after their parents, so the last node is visited first.
-    value = jax.lax.scan(visit, jnp.full(tree.num_nodes, -jnp.inf), jnp.arange(tree.num_nodes), reverse=True)[1]
+    value = jax.lax.scan(
+        visit,
+        jnp.full(tree.num_nodes, -jnp.inf, jnp.float32),
+        jnp.arange(tree.num_nodes, dtype=jnp.int32),
+        reverse=True,
+    )[1]
     return jnp.where(open_edges(tree, state), value, -jnp.inf)
 
 
@@ -154,8 +159,8 @@ class LogicValueIteration(Checked, HighLevel):
         value = jax.vmap(values, in_axes=(None, 0, 0))(params["high"], tree, state)
         best = jnp.where(feasible.any(-1), value.max(-1), 0.0)
         logits = jnp.where(feasible, self.sharpness * (value - best[:, None]), MASKED)
-        value = low.value_of(params, view, instructions, logits.argmax(-1), feasible)
-        return Choice(logits, value, jnp.zeros(logits.shape), instructions.ahead)
+        value = low.value_of(params, view, instructions, logits.argmax(-1).astype(jnp.int32), feasible)
+        return Choice(logits, value, jnp.zeros(logits.shape, jnp.float32), instructions.ahead)
 
     def low_level_rewards(self, experience: Experience) -> Rewards:
         """Each option is over when its sub-task is, and earns 1 if it reached its goal, whatever the task pays."""

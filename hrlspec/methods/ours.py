@@ -77,7 +77,7 @@ class ImplicitPlanner(Checked, HighLevel):
     def init(self, key: Key[Array, ""], low: LowLevel, view: View, tree: TaskTree) -> Any:
         """See :class:`HighLevel`."""
         state = TaskState(jnp.int32(0), jnp.zeros(tree.num_nodes, bool), jnp.int32(0))
-        return self.planner(low).init(key, view, tree, state, jnp.zeros(tree.num_nodes))
+        return self.planner(low).init(key, view, tree, state, jnp.zeros(tree.num_nodes, jnp.float32))
 
     def choose(
         self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, instructions: Instruction
@@ -103,7 +103,9 @@ class ImplicitPlanner(Checked, HighLevel):
         """
         if self.learns_from_copies or self.max_operator:
             return super().judge(low, params, view, tree, state, instructions)
-        return Judgement(jnp.zeros(state.node.shape), self.advise(low, params, view, tree, state, instructions)[0])
+        return Judgement(
+            jnp.zeros(state.node.shape, jnp.float32), self.advise(low, params, view, tree, state, instructions)[0]
+        )
 
     def advise(
         self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, instructions: Instruction
@@ -120,7 +122,7 @@ class ImplicitPlanner(Checked, HighLevel):
             ``[B, N, D, P]``.
         """
         if not self.network.advice:
-            return jnp.zeros(tree.parent.shape), instructions.ahead
+            return jnp.zeros(tree.parent.shape, jnp.float32), instructions.ahead
         edge, known, paths = jax.vmap(self._paths, in_axes=(None, 0, 0, 0))(low, tree, state, instructions)
         num_paths = known.shape[1]
 
@@ -129,10 +131,10 @@ class ImplicitPlanner(Checked, HighLevel):
             seen = jax.tree.map(lambda x: x[env], view)
             return jax.vmap(low.control, in_axes=(None, 0, 0))(params, seen, path)[1]
 
-        env = jnp.repeat(jnp.arange(known.shape[0]), num_paths)
+        env = jnp.repeat(jnp.arange(known.shape[0], dtype=jnp.int32), num_paths)
         flat_paths = jax.tree.map(lambda x: x.reshape((known.size, *x.shape[2:])), paths)
         group = 2 * low.config.group
-        values = in_groups(value, known.reshape(-1), (env, flat_paths), jnp.zeros(env.shape), group)
+        values = in_groups(value, known.reshape(-1), (env, flat_paths), jnp.zeros(env.shape, jnp.float32), group)
         advice, ahead = jax.vmap(_best_paths)(edge, known, values.reshape(known.shape), paths.ahead, instructions.ahead)
         return jax.lax.stop_gradient(advice), ahead
 
@@ -203,7 +205,7 @@ def _best_paths(
     default_ahead: Float32[Array, "N D P"],
 ) -> tuple[Float32[Array, " N"], Float32[Array, "N D P"]]:
     """From values of paths ``[L]`` to each edge's best value ``[N]`` and what lies ahead on its best path."""
-    mine = (edge == jnp.arange(default_ahead.shape[0])[:, None]) & known
+    mine = (edge == jnp.arange(default_ahead.shape[0], dtype=jnp.int32)[:, None]) & known
     score = jnp.where(mine, values, -jnp.inf)
     worst = jnp.where(known.any(), jnp.where(known, values, jnp.inf).min(), 0.0)
     advice = jnp.where(mine.any(1), score.max(1), worst)

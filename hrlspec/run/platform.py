@@ -36,7 +36,8 @@ _QUICK: dict[str, str | bool] = {"xla_backend_optimization_level": "1", "xla_cpu
 def prepare() -> None:
     """Sets XLA's flags for this version of JAX and a compilation cache that later processes share.
 
-    What the user set in ``XLA_FLAGS``, ``JAX_COMPILATION_CACHE_DIR`` and JAX's other variables stays as it is.
+    What the user set in ``XLA_FLAGS``, ``JAX_COMPILATION_CACHE_DIR`` and JAX's other variables stays as it is, but for
+    ``JAX_ENABLE_X64``: runs compute in single precision, and are the same wherever they are started.
 
     Raises:
         UserError: XLA would end the process because of its flags, or there is no device to compute on.
@@ -44,6 +45,7 @@ def prepare() -> None:
     _keep_freed_memory()
     flags = _flags_of_user(os.environ.get("XLA_FLAGS", ""))
     os.environ["XLA_FLAGS"] = with_loop_option(flags, jax.__version_info__)
+    jax.config.update("jax_enable_x64", False)
     folder = cache_folder()
     if jax.config.values["jax_compilation_cache_dir"] is None and folder is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))

@@ -33,7 +33,7 @@ def task_hash(tree: TaskTree) -> UInt32[Array, ""]:
     """
     edge = tree.valid & (tree.parent >= 0)
     own = _own_words(tree, jnp)
-    index = jnp.arange(tree.num_nodes)
+    index = jnp.arange(tree.num_nodes, dtype=jnp.int32)
 
     def absorb(below: UInt32[Array, " N"], node: tuple[Array, ...]) -> tuple[UInt32[Array, " N"], None]:
         i, parent, is_edge, word = node

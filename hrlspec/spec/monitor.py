@@ -66,7 +66,7 @@ def advance(tree: TaskTree, state: TaskState, labels: Bool[Array, " P"], assigne
     still_open = candidates & ~harmed
     met = still_open & (~tree.reach | labels).all(-1)
     num_propositions = tree.reach.shape[-1]
-    preference = tree.reach.sum(-1) + (num_propositions + 1) * (jnp.arange(tree.num_nodes) == assigned)
+    preference = tree.reach.sum(-1) + (num_propositions + 1) * (jnp.arange(tree.num_nodes, dtype=jnp.int32) == assigned)
     taken = jnp.argmax(jnp.where(met, preference, -1)).astype(jnp.int32)
     moved = met.any() & running
     node = jnp.where(moved, taken, state.node)

@@ -45,7 +45,7 @@ def update(
     """Counts finished episodes of the current level; after a full window, promotes or starts a new window."""
     finished, succeeded = curriculum.finished + finished, curriculum.succeeded + succeeded
     verdict = finished >= config.window
-    passed = verdict & (succeeded >= config.promotion * finished)
+    passed = verdict & (succeeded >= jnp.float32(config.promotion) * finished)
     return Curriculum(
         level=jnp.minimum(curriculum.level + passed, config.levels - 1).astype(jnp.int32),
         finished=jnp.where(verdict, 0, finished),

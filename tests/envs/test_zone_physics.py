@@ -179,25 +179,22 @@ def recorded_lidar(file: str) -> np.ndarray:
     return np.stack([observation[:, start : start + 16] for start in starts], 1)
 
 
-@PRECISIONS
 @pytest.mark.parametrize("file", FILES)
-def test_lidar_and_membership(file: str, x64: bool) -> None:
+def test_lidar_and_membership(file: str) -> None:
     record = recorded(file)
     deepltl = file.startswith("deepltl")
     env = PRESETS["zone" if deepltl else "zone-ltl2action"]()
-    with jax.enable_x64(x64):
-        bodies, zones = jnp.asarray(record["body"]), jnp.asarray(record["zones"])
-        layout = ZoneLayout(robot=bodies[0, :3], zones=zones)
-        _, state = env.reset_to(layout, jax.random.key(0), env.default_params)
-        states = jax.vmap(lambda body: state.replace(body=body))(bodies)
-        labels = jax.jit(jax.vmap(env.labels, (0, None)))(states, env.default_params)
-        observations = jax.jit(jax.vmap(env.observation, (0, None)))(states, env.default_params)
-        lidar, shared = jax.vmap(env.proposition_view)(observations)
+    bodies, zones = jnp.asarray(record["body"]), jnp.asarray(record["zones"])
+    layout = ZoneLayout(robot=bodies[0, :3], zones=zones)
+    _, state = env.reset_to(layout, jax.random.key(0), env.default_params)
+    states = jax.vmap(lambda body: state.replace(body=body))(bodies)
+    labels = jax.jit(jax.vmap(env.labels, (0, None)))(states, env.default_params)
+    observations = jax.jit(jax.vmap(env.observation, (0, None)))(states, env.default_params)
+    lidar, shared = jax.vmap(env.proposition_view)(observations)
     np.testing.assert_array_equal(labels[1:], record["props" if deepltl else "events"][1:])
-    tolerance = 1e-12 if x64 else 1e-5
-    np.testing.assert_allclose(lidar, recorded_lidar(file), atol=tolerance)
+    np.testing.assert_allclose(lidar, recorded_lidar(file), atol=1e-5)
     if deepltl:
-        np.testing.assert_allclose(shared[1:, 12:], record["wall_sensor"][1:], atol=tolerance)
+        np.testing.assert_allclose(shared[1:, 12:], record["wall_sensor"][1:], atol=1e-5)
 
 
 def test_lidar_is_a_plain_reading_of_its_definition() -> None:

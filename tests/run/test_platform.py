@@ -104,6 +104,7 @@ assert float(jax.jit(lambda x: x + 1)(jnp.ones(()))) == 2  # XLA knows the flags
 print(jax.config.jax_compilation_cache_dir)
 print(jax.config.jax_persistent_cache_min_compile_time_secs)
 print(os.environ["XLA_FLAGS"])
+assert jnp.ones(()).dtype == "float32"  # whatever JAX_ENABLE_X64 says
 """
 
 
@@ -125,7 +126,7 @@ def prepared(**environment: str) -> list[str]:
 def test_the_cache_belongs_to_user_and_version(tmp_path: Path) -> None:
     import jaxlib.version
 
-    folder, least, flags = prepared(XDG_CACHE_HOME=str(tmp_path), JAX_PLATFORMS="cpu")
+    folder, least, flags = prepared(XDG_CACHE_HOME=str(tmp_path), JAX_PLATFORMS="cpu", JAX_ENABLE_X64="1")
     assert folder == f"{tmp_path}/hrlspec/jaxlib-{jaxlib.version.__version__}"
     assert float(least) == 0.2
     assert flags == with_loop_option("", jax.__version_info__)

@@ -128,7 +128,7 @@ class Controller(nn.Module):
             outputs = outputs[order]
         elif signs is not None:
             # The outputs are means and deviations: a mean changes its sign with the action, its deviation does not.
-            outputs = outputs * jnp.concatenate([signs, jnp.ones(self.num_outputs - len(signs))])
+            outputs = outputs * jnp.concatenate([signs, jnp.ones(self.num_outputs - len(signs), jnp.float32)])
         return outputs, self.critic(x)[0]
 
     def everything(

@@ -36,7 +36,7 @@ def randomised(key: Key[Array, ""], deviations: Any) -> Any:
     """
     flat, restore = jax.flatten_util.ravel_pytree(deviations)
     within = 2.0  # standard deviations; what remains of a standard normal there has the deviation divided by
-    drawn = flat * jax.random.truncated_normal(key, -within, within, flat.shape) / 0.87962566
+    drawn = flat * jax.random.truncated_normal(key, -within, within, flat.shape, jnp.float32) / 0.87962566
     return restore(jax.lax.optimization_barrier(drawn))  # or each layer's slice would draw all of them anew
 
 
@@ -142,5 +142,5 @@ class Encoder(nn.Module):
         for i, width in enumerate(self.conv_channels):
             shape = (4 * (self.conv_channels[i - 1] if i else channels), width)
             weights = self.param(f"conv_{i}", initializer(2.0**0.5), shape)
-            layers.append((weights, self.param(f"conv_{i}_bias", nn.initializers.zeros, (width,))))
+            layers.append((weights, self.param(f"conv_{i}_bias", nn.initializers.zeros, (width,), jnp.float32)))
         return layers

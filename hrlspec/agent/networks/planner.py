@@ -86,7 +86,11 @@ class Planner(nn.Module):
             return latents.at[node].set(jnp.where(node == root, latent, child)), None
 
         scan = nn.scan(expand, variable_broadcast="params", split_rngs={"params": False})
-        return scan(self, jnp.zeros((tree.num_nodes, latent.shape[-1])), jnp.arange(tree.num_nodes))[0]
+        return scan(
+            self,
+            jnp.zeros((tree.num_nodes, latent.shape[-1]), jnp.float32),
+            jnp.arange(tree.num_nodes, dtype=jnp.int32),
+        )[0]
 
     def embed(self, latents: Float32[Array, "N latent"], tree: TaskTree, state: TaskState) -> Float32[Array, "N F"]:
         """Backward pass: messages flow from children to parents over reversed edges (eq. 3), ``[N, F]``.

@@ -51,7 +51,7 @@ def _goals(view: tuple[Planes, Shared]) -> Float32[Array, "P F"]:
         [
             planes.reshape(num_propositions, -1),
             jnp.broadcast_to(shared, (num_propositions, shared.shape[0])),
-            jnp.eye(num_propositions),
+            jnp.eye(num_propositions, dtype=jnp.float32),
         ],
         axis=-1,
     )

@@ -66,14 +66,15 @@ def reflect(
     # Weights of the features as they are, one row for each reflection.
     weights = np.array(reflections.sector, np.float32)[np.argsort(orders)]
     after = planes[2] if lookahead else jnp.zeros_like(planes[0])
-    moves = np.array(reflections.signs, np.float32) * np.array(reflections.heading, np.float32)
+    signs = np.array(reflections.signs, np.float32)
+    moves = signs * np.array(reflections.heading, np.float32)
     best = jnp.argmax(weights @ (0.05 * planes[0] + after) + (shared[np.array(reflections.shared)] * moves).sum(-1))
 
     def chosen(rows: Any) -> Shaped[Array, "..."]:
         return jnp.asarray(np.array(rows))[best]
 
     planes = planes[:, chosen(orders)]
-    return planes, shared[chosen(reflections.shared)] * chosen(reflections.signs), chosen(reflections.actions)
+    return planes, shared[chosen(reflections.shared)] * chosen(signs), chosen(reflections.actions)
 
 
 TURNS = tuple(itertools.product((False, True), repeat=3))

@@ -41,7 +41,7 @@ def sweep_up(visit: Callable[..., Any], module: nn.Module, carry: Any) -> Any:
     """
     num_nodes = jax.tree.leaves(carry)[0].shape[0]
     scan = nn.scan(visit, variable_broadcast="params", split_rngs={"params": False}, reverse=True)
-    return scan(module, carry, jnp.arange(num_nodes))[1]
+    return scan(module, carry, jnp.arange(num_nodes, dtype=jnp.int32))[1]
 
 
 def lookahead(tree: TaskTree, depth: int) -> Bool[Array, "N D P"]:
@@ -69,7 +69,7 @@ def routes(tree: TaskTree, node: Int32[Array, ""], length: int) -> Int32[Array, 
 
     ``NO_NODE`` after the end of the path, and everywhere for nodes that are not below.
     """
-    place = jnp.arange(length)
+    place = jnp.arange(length, dtype=jnp.int32)
     nothing = jnp.full((tree.num_nodes, length), TaskTree.NO_NODE, jnp.int32)
 
     def climb(_: Any, carry: Any) -> tuple[Int32[Array, " N"], Int32[Array, "N length"]]:
@@ -112,7 +112,7 @@ class TaskEmbedding(nn.Module):
             return self._sweep(tree)[0]
         sends = tree.edges
         edge = self._edge(tree)
-        x = jnp.zeros((tree.num_nodes, self.features))
+        x = jnp.zeros((tree.num_nodes, self.features), jnp.float32)
         for _ in range(self.rounds):
             x = nn.tanh(self.own(x) + sum_to_parents(nn.tanh(self.message(x) + edge), tree.parent, sends))
         return x
@@ -125,7 +125,7 @@ class TaskEmbedding(nn.Module):
         self, messages: Float32[Array, "*lead N F"], edges: Bool[Array, "*lead N"]
     ) -> Float32[Array, "*lead F"]:
         """Embeds the task that begins with some edges (bool ``[..., N]``) of one node, ``[..., F]``."""
-        return nn.tanh(self.own(jnp.zeros(self.features)) + (messages * edges[..., None]).sum(-2))
+        return nn.tanh(self.own(jnp.zeros(self.features, jnp.float32)) + (messages * edges[..., None]).sum(-2))
 
     def _edge(self, tree: TaskTree) -> Float32[Array, "N F"]:
         parts = [tree.reach, tree.avoid] if self.negatives else [tree.reach]
@@ -135,7 +135,7 @@ class TaskEmbedding(nn.Module):
         """Embeddings of all progressions, and the message sent along each edge, ``[N, F]`` each."""
         sends = tree.edges
         edge = self._edge(tree)
-        nothing = jnp.zeros((tree.num_nodes, self.features))
+        nothing = jnp.zeros((tree.num_nodes, self.features), jnp.float32)
         bias = self.own(nothing[0])
 
         def visit(
@@ -149,7 +149,7 @@ class TaskEmbedding(nn.Module):
 
     def of_sequence(self, ahead: Float32[Array, "D P"]) -> Float32[Array, " F"]:
         """Embeds a sequence of sub-tasks as the sweep would, ``[F]``; p₊ is ``[D, P]``, empty rows after its end."""
-        bias = self.own(jnp.zeros(self.features))
+        bias = self.own(jnp.zeros(self.features, jnp.float32))
         x = nn.tanh(bias)
         for reach in ahead[::-1]:
             x = nn.tanh(bias + reach.any() * nn.tanh(self.message(x) + self.edge(reach)))
