@@ -4,7 +4,7 @@ Out of this library; each module needs only its own library:
 
 * `envs_jax.adapters.gymnasium`: single and vector environments (extra ``gymnasium``),
 * `envs_jax.adapters.brax`: a brax ``Env`` (extra ``brax``),
-* `envs_jax.adapters.gymnax`: the five-tuple interface of gymnax (nothing to install).
+* `envs_jax.adapters.gymnax`: the interface of gymnax, before 1.0 or since (nothing to install).
 
 Into it; whoever has such an environment has its library:
 

@@ -12,7 +12,7 @@ import math
 import jax
 import jax.numpy as jnp
 
-from envs_jax.adapters.tasks import Tasks, begin, begin_where, reading, step
+from envs_jax.adapters.tasks import Tasks, begin, begin_where, reading, step, typed_key
 from envs_jax.base import Box, Environment, EnvParams
 
 try:
@@ -84,7 +84,7 @@ class BraxEnv(Env):
 
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode in a new layout. ``rng`` is a key of either kind, and consumed."""
-        key, start_key = jax.random.split(_typed(rng))
+        key, start_key = jax.random.split(typed_key(rng))
         observation, episode = begin(self.env, self._tasks, start_key, self._task, self._params)
         labels = self.env.labels(episode.state, self._params)
         zero = jnp.float32(0.0)
@@ -93,7 +93,7 @@ class BraxEnv(Env):
 
     def step(self, state: State, action: jax.Array) -> State:
         """One step."""
-        key, step_key = jax.random.split(_typed(state.info["key"]))
+        key, step_key = jax.random.split(typed_key(state.info["key"]))
         episode, now = step(
             self.env, self._tasks, step_key, state.pipeline_state, self._task, self._native(action), self._params
         )
@@ -111,7 +111,7 @@ class BraxEnv(Env):
 
         Reward, ``done`` and metrics stay those of the step that ended the episode.
         """
-        key, restart_key = jax.random.split(_typed(state.info["key"]))
+        key, restart_key = jax.random.split(typed_key(state.info["key"]))
         now = state.obs.reshape(self.env.observation_shape)
         observation, episode = begin_where(
             self.env, self._tasks, done, restart_key, now, state.pipeline_state, self._task, self._params
@@ -153,8 +153,3 @@ def wrap(env: BraxEnv, episode_length: int | None = None, action_repeat: int = 1
     """
     length = env.horizon if episode_length is None else episode_length
     return NewLayoutWrapper(EpisodeWrapper(VmapWrapper(env), length, action_repeat))
-
-
-def _typed(rng: jax.Array) -> jax.Array:
-    """A typed key; brax's are ``uint32 [2]``."""
-    return rng if jnp.issubdtype(rng.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(rng)

@@ -1,4 +1,10 @@
-"""Environments with gymnax's five-tuple interface, for code that was written against it. Needs nothing installed."""
+"""Environments with gymnax's interface, for its wrappers and for code written against it. Needs nothing installed.
+
+That is the interface of gymnax before 1.0, as purejaxrl and rejax use it, where a step gives five values; or, if asked
+for, that of 1.0, where it gives six. Keys are of either kind. What wants more of gymnax's class than the methods here
+(``get_obs``, ``is_terminal``, ``state_space``, the conversions to Gym, dm_env and brax in ``gymnax.wrappers``) is not
+there; for Gymnasium and brax there are adapters of their own.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +16,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from envs_jax.adapters.tasks import Episode, Step, Task, Tasks, begin, begin_where, reading, step
+from envs_jax.adapters.tasks import Episode, Step, Task, Tasks, begin, begin_where, reading, step, typed_key
 from envs_jax.base import Box, Discrete, Environment, EnvParams, Info
 
 FiveTuple = tuple[jax.Array, Episode, jax.Array, jax.Array, Info]
+SixTuple = tuple[jax.Array, Episode, jax.Array, jax.Array, jax.Array, Info]
 
 
 @struct.dataclass
@@ -28,6 +35,11 @@ class GymnaxParams:
     env: EnvParams
     task: Task
 
+    @property
+    def max_steps_in_episode(self) -> jax.Array:
+        """The horizon, int32 ``[]``, by gymnax's name; to change it, replace the one in ``env``."""
+        return self.env.horizon
+
 
 @dataclasses.dataclass(frozen=True)
 class GymnaxEnv:
@@ -40,11 +52,13 @@ class GymnaxEnv:
         env: the environment.
         tasks: the language of its tasks; without one, no task can be given.
         task: the task of ``default_params``; without one, the bare environment.
+        six: whether :meth:`step` gives ``terminated`` and ``truncated`` in place of ``done``, as gymnax 1.0 does.
     """
 
     env: Environment
     tasks: Tasks | None = None
     task: str | None = None
+    six: bool = False
 
     def __post_init__(self) -> None:
         reading(self.tasks, self.task)  # A task that cannot be read is refused here.
@@ -75,45 +89,60 @@ class GymnaxEnv:
             raise ValueError(f"found the task {text!r} for an environment made without one; give it `task` first")
         return GymnaxParams(env=self.env.default_params, task=reading(self.tasks, text)[1])
 
-    def action_space(self, params: GymnaxParams | None = None) -> Box | Discrete:
-        """Where actions lie."""
-        return self.env.action_space
+    def action_space(self, params: GymnaxParams | None = None) -> Any:
+        """Where actions lie: a space of gymnax's where it is installed, since its users ask for the class."""
+        return _space(self.env.action_space)
 
-    def observation_space(self, params: GymnaxParams | None = None) -> Box:
-        """Where observations lie."""
-        return self.env.observation_space
+    def observation_space(self, params: GymnaxParams | None = None) -> Any:
+        """Where observations lie; likewise."""
+        return _space(self.env.observation_space)
 
     def reset(self, key: jax.Array, params: GymnaxParams | None = None) -> tuple[jax.Array, Episode]:
         """Starts an episode in a new layout: ``(observation, state)``. The key is consumed."""
         params = self.default_params if params is None else params
-        return begin(self.env, self._language, key, params.task, params.env)
+        return begin(self.env, self._language, typed_key(key), params.task, params.env)
 
-    def step(self, key: jax.Array, state: Episode, action: jax.Array, params: GymnaxParams | None = None) -> FiveTuple:
+    def step(
+        self, key: jax.Array, state: Episode, action: jax.Array, params: GymnaxParams | None = None
+    ) -> FiveTuple | SixTuple:
         """One step with auto-reset: ``(observation, state, reward, done, info)``. The key is consumed.
 
         Where the episode ended, observation and state are the next one's first, in a new layout;
         ``info["final_observation"]`` is what the step led to, and everything else in ``info`` belongs to it.
         """
         params = self.default_params if params is None else params
-        step_key, restart_key = jax.random.split(key)
+        step_key, restart_key = jax.random.split(typed_key(key))
         observation, state, reward, done, info = self.step_env(step_key, state, action, params)
         info["final_observation"] = observation
         observation, state = begin_where(
             self.env, self._language, done, restart_key, observation, state, params.task, params.env
         )
+        if self.six:
+            return observation, state, reward, info["terminated"], info["truncated"], info
         return observation, state, reward, done, info
 
     def step_env(
         self, key: jax.Array, state: Episode, action: jax.Array, params: GymnaxParams | None = None
     ) -> FiveTuple:
-        """One step without auto-reset."""
+        """One step without auto-reset; five values in either case."""
         params = self.default_params if params is None else params
-        state, now = step(self.env, self._language, key, state, params.task, action, params.env)
+        state, now = step(self.env, self._language, typed_key(key), state, params.task, action, params.env)
         return now.observation, state, now.reward, now.terminated | now.truncated, _info(now)
 
     @property
     def _language(self) -> Any:
         return reading(self.tasks, self.task)[0]
+
+
+def _space(space: Box | Discrete) -> Any:
+    """The same space as gymnax makes it, if it can."""
+    try:
+        from gymnax.environments import spaces
+    except ImportError:
+        return space
+    if isinstance(space, Discrete):
+        return spaces.Discrete(space.n)
+    return spaces.Box(space.low, space.high, space.shape, space.dtype)
 
 
 def _info(now: Step) -> Info:

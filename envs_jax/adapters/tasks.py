@@ -198,3 +198,8 @@ def reading(tasks: Tasks | None, text: str | None) -> tuple[Tasks, Task]:
         raise ValueError(f"found a task of type {type(text).__name__}, expected text")
     language = NO_TASKS if tasks is None else tasks
     return language, language.read(text)
+
+
+def typed_key(key: jax.Array) -> Key[Array, ""]:
+    """A key of either kind as a typed one; brax's and gymnax's are uint32 ``[2]``."""
+    return key if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(key)
