@@ -204,6 +204,8 @@ class Environment(abc.ABC):
     ) -> StepResult:
         """One raw step, without auto-reset.
 
+        Actions are not checked: numbers beyond a box count as its nearest, and a NaN goes into the state and stays.
+
         Returns:
             ``(observation, state, reward, terminated, truncated, info)``: reward float32 ``[]``, ``terminated``
             and ``truncated`` bool ``[]``. Values bootstrap on truncation, never on termination.

@@ -1,6 +1,9 @@
 """Gymnasium environments whose task is SPECTRL text.
 
 ``env = hrlspec.gymnasium.make("letter"); env.reset(seed=0, options={"task": "achieve a; achieve b"})``.
+
+Importing this module makes every preset known to ``gymnasium.make`` and ``gymnasium.make_vec`` by an id such as
+``hrlspec/letter-v0``; ``gymnasium.make("hrlspec.gymnasium:hrlspec/letter-v0")`` imports it by itself.
 """
 
 from __future__ import annotations
@@ -14,19 +17,28 @@ from envs_jax.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
 from hrlspec.tasks.text_tasks import TextTasks
 
 
-def make(env: str | Environment, *, task: str | None = None, max_nodes: int = 64, **overrides: Any) -> GymnasiumEnv:
+def make(
+    env: str | Environment,
+    *,
+    task: str | None = None,
+    max_nodes: int = 64,
+    render_mode: None = None,
+    **overrides: Any,
+) -> GymnasiumEnv:
     """One environment.
 
     Args:
         env: an environment, or a name that `envs_jax.make` knows.
         task: the task until ``reset(options={"task": ...})`` gives another.
         max_nodes: the largest task tree that can be given.
+        render_mode: none but ``None``, which makers of environments pass.
         **overrides: sizes that differ from the preset's, for example ``size=9``.
 
     Raises:
         ValueError: if the environment or a size is unknown, or the task cannot be read.
+        TypeError: if it is to be rendered.
     """
-    world = _world(env, overrides)
+    world = _world(env, render_mode, overrides)
     return GymnasiumEnv(world, TextTasks(world.propositions, max_nodes), task=task)
 
 
@@ -36,15 +48,16 @@ def make_vec(
     *,
     task: str | Sequence[str] | None = None,
     max_nodes: int = 64,
+    render_mode: None = None,
     **overrides: Any,
 ) -> GymnasiumVectorEnv:
     """Many environments side by side; a task for all of them or one for each, see :func:`make`."""
-    world = _world(env, overrides)
+    world = _world(env, render_mode, overrides)
     return GymnasiumVectorEnv(world, num_envs, TextTasks(world.propositions, max_nodes), task=task)
 
 
 def register(namespace: str = "hrlspec") -> tuple[str, ...]:
-    """Makes every preset known to ``gymnasium.make`` and ``gymnasium.make_vec``; nothing is registered otherwise.
+    """Makes every preset known to ``gymnasium.make`` and ``gymnasium.make_vec``, under another namespace if wanted.
 
     Returns:
         The ids, such as ``hrlspec/letter-v0``.
@@ -64,9 +77,14 @@ def register(namespace: str = "hrlspec") -> tuple[str, ...]:
     return tuple(ids)
 
 
-def _world(env: str | Environment, overrides: dict[str, Any]) -> Environment:
+def _world(env: str | Environment, render_mode: None, overrides: dict[str, Any]) -> Environment:
+    if render_mode is not None:  # a TypeError tells Stable-Baselines3 to try without
+        raise TypeError(f"found render_mode {render_mode!r}, expected None: these environments have no render modes")
     if isinstance(env, str):
         return envs_jax.make(env, **overrides)
     if overrides:
         raise ValueError(f"found sizes ({', '.join(overrides)}) for an environment that is made already")
     return env
+
+
+register()

@@ -64,7 +64,8 @@ class BraxEnv(Env):
         self.env = env
         self.horizon = env.horizon
         self._params = env.default_params if params is None else params
-        self._tasks, self._task = reading(tasks, task)
+        self._tasks, read = reading(tasks, task)
+        self._task = jax.tree.map(jnp.asarray, read)
 
     @property
     def observation_size(self) -> int:

@@ -1,17 +1,23 @@
 """Environments for Gymnasium: one at a time, and many side by side in one compiled call.
 
+Nothing is computed before the first reset, so that environments can be made, and the process forked, before JAX starts
+its threads. In a fork of a process in which it had started them, JAX would wait for ever: a reset refuses there.
+
 Axes: **E** environments, **P** atomic propositions.
 """
 
 from __future__ import annotations
 
 import functools
+import os
+import sys
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax._src.xla_bridge import backends_are_initialized  # no public name says whether JAX has started
 
 from envs_jax.adapters.tasks import Episode, Step, Task, Tasks, begin, begin_where, reading, step
 from envs_jax.base import Box, Discrete, Environment, EnvParams, Layout
@@ -26,6 +32,18 @@ except ImportError as error:
     raise ImportError('the Gymnasium adapter needs the extra "adapters": pip install "hrlspec[adapters]"') from error
 
 OPTIONS = ("task", "layout")
+
+_UNUSABLE: set[int] = set()
+"""This process, if it was forked from one in which JAX had started."""
+
+
+def _note_fork() -> None:
+    if backends_are_initialized():
+        _UNUSABLE.add(os.getpid())
+
+
+if sys.platform != "win32":
+    os.register_at_fork(after_in_child=_note_fork)
 
 
 class GymnasiumEnv(gymnasium.Env[np.ndarray, Any]):
@@ -68,7 +86,7 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, Any]):
         self.observation_space = _space(env.observation_space)
         self.action_space = _space(env.action_space)
         self._env, self._language = env, tasks
-        self._params = env.default_params if params is None else params
+        self._params = params
         self._text = task
         self._tasks, self._task = reading(tasks, task)
         self._key: jax.Array | None = None
@@ -82,12 +100,15 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, Any]):
         Raises:
             ValueError: if an option is unknown, the task cannot be read or the layout cannot be used.
         """
+        _check_fork()
         options = _checked_options(options)
         layout = _layouts(self._env, options["layout"], None) if "layout" in options else None
         if "task" in options:
             self._tasks, self._task = reading(self._language, options["task"])
             self._text = options["task"]
         super().reset(seed=seed)
+        if self._params is None:
+            self._params = self._env.default_params
         self._key = _key(self.np_random)
         self._key, observation, self._episode, labels = _begin(
             self._env, self._tasks, self._key, self._task, self._params, layout
@@ -154,7 +175,7 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._env, self._language = env, tasks
-        self._params = env.default_params if params is None else params
+        self._params = params
         self._give(task)
         self._keys: jax.Array | None = None
         self._episodes: Episode | None = None
@@ -168,6 +189,7 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             ValueError: if an option is unknown, there are not E seeds or tasks, one of them cannot be read, or a
                 layout cannot be used.
         """
+        _check_fork()
         options = _checked_options(options)
         layouts = _layouts(self._env, options["layout"], self.num_envs) if "layout" in options else None
         generators = self._generators(seed)
@@ -175,6 +197,8 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._give(options["task"])
         if generators is not None:
             super().reset(seed=seed if isinstance(seed, int) else None)
+        if self._params is None:
+            self._params = self._env.default_params
         keys = jnp.stack([_key(g) for g in generators or [self.np_random] * self.num_envs])
         self._keys, observation, self._episodes, labels = _begin_all(
             self._env, self._tasks, keys, self._task, self._params, layouts
@@ -220,7 +244,7 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         read = {text: reading(self._language, text) for text in texts}
         tasks = [read[text][1] for text in texts]
         self._tasks: Tasks = read[texts[0]][0]
-        self._task: Task = jax.tree.map(lambda *leaves: jnp.stack(leaves), *tasks)
+        self._task: Task = jax.tree.map(lambda *leaves: np.stack(leaves), *tasks)
         self._texts = [text or "" for text in texts]
 
     def _generators(self, seed: int | Sequence[int] | None) -> list[np.random.Generator] | None:
@@ -283,6 +307,15 @@ def _step_all(
     return jax.vmap(one)(keys, episodes, task, actions)
 
 
+def _check_fork() -> None:
+    """Raises ``RuntimeError`` where JAX would wait for ever."""
+    if os.getpid() in _UNUSABLE:
+        raise RuntimeError(
+            "JAX had started in the process that this one was forked from, and cannot run here; start processes with "
+            'context="spawn", or before anything is computed, or step many environments in one with make_vec'
+        )
+
+
 def _key(generator: np.random.Generator) -> jax.Array:
     return jax.random.key(int(generator.integers(2**31)))
 
@@ -302,7 +335,10 @@ def _checked_options(options: dict[str, Any] | None) -> dict[str, Any]:
 
 
 def _checked_action(env: Environment, action: Any, batch: tuple[int, ...]) -> np.ndarray:
-    """The action as an array of the right type and shape; JAX would read an index out of range as another one."""
+    """The action as an array of the right type and shape.
+
+    JAX would read an index out of range as another one, and a NaN would stay in the state for ever.
+    """
     space = env.action_space
     found = np.asarray(action)
     if found.shape != (*batch, *space.shape):
@@ -311,6 +347,8 @@ def _checked_action(env: Environment, action: Any, batch: tuple[int, ...]) -> np
         np.issubdtype(found.dtype, np.integer) and ((found >= 0) & (found < space.n)).all()
     ):
         raise ValueError(f"found action {found.tolist()}, expected integers from 0 to {space.n - 1}")
+    if isinstance(space, Box) and np.isnan(found).any():
+        raise ValueError(f"found action {found.tolist()}, expected numbers")
     return found.astype(space.dtype)
 
 

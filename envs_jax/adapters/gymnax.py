@@ -71,7 +71,7 @@ class GymnaxEnv:
     @property
     def default_params(self) -> GymnaxParams:
         """The parameters with the task of this environment."""
-        return GymnaxParams(env=self.env.default_params, task=reading(self.tasks, self.task)[1])
+        return self._params_for(self.task)
 
     @property
     def num_actions(self) -> int:
@@ -87,7 +87,7 @@ class GymnaxEnv:
         """
         if self.task is None:
             raise ValueError(f"found the task {text!r} for an environment made without one; give it `task` first")
-        return GymnaxParams(env=self.env.default_params, task=reading(self.tasks, text)[1])
+        return self._params_for(text)
 
     def action_space(self, params: GymnaxParams | None = None) -> Any:
         """Where actions lie: a space of gymnax's where it is installed, since its users ask for the class."""
@@ -128,6 +128,10 @@ class GymnaxEnv:
         params = self.default_params if params is None else params
         state, now = step(self.env, self._language, typed_key(key), state, params.task, action, params.env)
         return now.observation, state, now.reward, now.terminated | now.truncated, _info(now)
+
+    def _params_for(self, text: str | None) -> GymnaxParams:
+        task = jax.tree.map(jnp.asarray, reading(self.tasks, text)[1])
+        return GymnaxParams(env=self.env.default_params, task=task)
 
     @property
     def _language(self) -> Any:

@@ -45,7 +45,7 @@ class Tasks(Protocol):
     """A task language. A static, hashable value; its pure methods are jitted and vmapped."""
 
     def read(self, text: str) -> Task:
-        """The task that a text means, with the same shapes for every text. On the host.
+        """The task that a text means, numpy leaves, with the same shapes for every text. On the host.
 
         Raises:
             ValueError: if the text means no task.
@@ -187,7 +187,7 @@ def begin_where(
 
 
 def reading(tasks: Tasks | None, text: str | None) -> tuple[Tasks, Task]:
-    """The language to use for a text, and the task: no task at all where there is no text.
+    """The language to use for a text, and the task, numpy leaves: no task at all where there is no text.
 
     Raises:
         ValueError: if there is a text but no language, or the text means no task.

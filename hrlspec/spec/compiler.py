@@ -33,7 +33,7 @@ from hrlspec.spec.tree import TaskTree
 MAX_NODES = 4096
 
 
-def compile_task(formula: Formula, propositions: Sequence[str], max_nodes: int) -> TaskTree:
+def compile_task(formula: Formula, propositions: Sequence[str], max_nodes: int, *, on_host: bool = False) -> TaskTree:
     """The task tree of a formula, padded to N nodes; children stand in the order of the text.
 
     Edges of one node with the same reach and avoid sets are one edge. An accepting node has no children: the task
@@ -45,9 +45,10 @@ def compile_task(formula: Formula, propositions: Sequence[str], max_nodes: int) 
         formula: the task.
         propositions: names of the environment's P propositions, in its order.
         max_nodes: N.
+        on_host: leave JAX alone, which starts its devices for its first array.
 
     Returns:
-        One task with JAX arrays.
+        One task with JAX arrays, or numpy's ``on_host``.
 
     Raises:
         SpecError: if the formula uses an unknown proposition, says what a task graph cannot (see
@@ -71,7 +72,10 @@ def compile_task(formula: Formula, propositions: Sequence[str], max_nodes: int) 
         builder.notes.append(formula.error(f"one alternative shadows another: {shadow}; whichever holds first decides"))
     for note in builder.notes:
         warnings.warn(str(note), SpecWarning, stacklevel=2)
-    return _unfold(root, graphs, len(propositions), max_nodes)
+    tree = _unfold(root, graphs, len(propositions), max_nodes)
+    if not on_host:
+        tree = jax.tree.map(jnp.asarray, tree)
+    return tree
 
 
 class _Builder:
@@ -130,7 +134,7 @@ class _Builder:
 
 
 def _unfold(root: int, graphs: Graphs, num_propositions: int, max_nodes: int) -> TaskTree:
-    """The tree in breadth-first order."""
+    """The tree in breadth-first order, numpy leaves."""
     parent = np.full(max_nodes, TaskTree.NO_NODE, np.int32)
     reach = np.zeros((max_nodes, num_propositions), bool)
     avoid = np.zeros((max_nodes, num_propositions), bool)
@@ -150,8 +154,4 @@ def _unfold(root: int, graphs: Graphs, num_propositions: int, max_nodes: int) ->
             reach[new], avoid[new] = members(goal), members(harm)
             accepting[new] = graphs.accepting[to]
     valid = np.arange(max_nodes) < len(order)
-    tree: TaskTree = jax.tree.map(
-        jnp.asarray,
-        TaskTree(parent=parent, reach=reach, avoid=avoid, accepting=accepting, valid=valid, depth=depth),  # type: ignore[arg-type]
-    )
-    return tree
+    return TaskTree(parent=parent, reach=reach, avoid=avoid, accepting=accepting, valid=valid, depth=depth)  # type: ignore[arg-type]

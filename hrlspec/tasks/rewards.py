@@ -67,11 +67,8 @@ def reward_machine(
     Raises:
         ValueError: if a rule names an unknown proposition.
     """
+    check_bonuses(propositions, bonuses)
     index = {name: i for i, name in enumerate(propositions)}
-    for rule in bonuses:
-        unknown = [name for name in (rule.first, rule.second, *rule.avoid) if name not in index]
-        if unknown:
-            raise ValueError(f"bonus rule {rule} names {unknown}, known propositions are {list(propositions)}")
     avoid = np.zeros((len(bonuses), len(propositions)), bool)
     for i, rule in enumerate(bonuses):
         avoid[i, [index[name] for name in rule.avoid]] = True
@@ -83,6 +80,14 @@ def reward_machine(
         avoid=jnp.asarray(avoid),
         bonus=jnp.asarray([rule.bonus for rule in bonuses], jnp.float32),
     )
+
+
+def check_bonuses(propositions: Sequence[str], bonuses: Sequence[Bonus]) -> None:
+    """Raises ``ValueError`` if a rule names an unknown proposition."""
+    for rule in bonuses:
+        unknown = [name for name in (rule.first, rule.second, *rule.avoid) if name not in propositions]
+        if unknown:
+            raise ValueError(f"bonus rule {rule} names {unknown}, known propositions are {list(propositions)}")
 
 
 def return_bounds(machine: RewardMachine, depth: int) -> tuple[float, float]:

@@ -10,7 +10,6 @@ import functools
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -32,7 +31,7 @@ from hrlspec.spec import (
 )
 from hrlspec.spec.subtasks import Subtask
 from hrlspec.tasks import rewards
-from hrlspec.tasks.rewards import Bonus, RewardMachine, reward_machine
+from hrlspec.tasks.rewards import Bonus, RewardMachine, check_bonuses, reward_machine
 
 STATUS = {RUNNING: "running", SATISFIED: "satisfied", VIOLATED: "violated"}
 
@@ -73,16 +72,15 @@ class TextTasks:
     bonuses: tuple[Bonus, ...] = ()
 
     def __post_init__(self) -> None:
-        self._machine()  # Wrong rules are refused here, not in the first step.
+        check_bonuses(self.propositions, self.bonuses)
 
     def read(self, text: str) -> TaskTree:
-        """The padded tree of a task.
+        """The padded tree of a task, numpy leaves.
 
         Raises:
             SpecError: if the text is no task, names unknown propositions or needs more than N nodes.
         """
-        tree: TaskTree = jax.tree.map(jnp.asarray, _read(text, self.propositions, self.max_nodes))
-        return tree
+        return _read(text, self.propositions, self.max_nodes)
 
     def start(self, task: TaskTree) -> TextProgress:
         """At the root, every rule waiting."""
@@ -129,8 +127,7 @@ class TextTasks:
 
 @functools.lru_cache(maxsize=4096)
 def _read(text: str, propositions: tuple[str, ...], max_nodes: int) -> TaskTree:
-    tree: TaskTree = jax.tree.map(np.asarray, compile_task(parse(text), propositions, max_nodes))
-    return tree
+    return compile_task(parse(text), propositions, max_nodes, on_host=True)
 
 
 @functools.lru_cache(maxsize=4096)

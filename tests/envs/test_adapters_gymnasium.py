@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -17,9 +21,11 @@ import hrlspec.gymnasium
 from envs_jax import Letter, Walk
 from envs_jax.adapters import gymnasium as adapter
 from envs_jax.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
+from envs_jax.zone.world import Zone
 from hrlspec.gymnasium import make, make_vec
 from tests.probes import Corridor, CorridorLayout
 
+ROOT = Path(__file__).parents[2]
 LEFT, RIGHT = 0, 1
 CORRIDOR = Corridor(starts=(2,))
 WANDERING = Corridor()
@@ -126,6 +132,20 @@ def test_wrong_calls_are_refused() -> None:
         make(CORRIDOR, horizon=3)
 
 
+def test_a_nan_is_no_action() -> None:
+    """It would stay in the state for ever. Numbers out of the box are actions, at its side."""
+    for world in (Zone(physics="closed-form"), Walk()):
+        single, vector = make(world), make_vec(world, 2)
+        single.reset(seed=0)
+        vector.reset(seed=0)
+        with pytest.raises(ValueError, match=r"found action \[nan, 0.0\], expected numbers"):
+            single.step(np.array([np.nan, 0.0], np.float32))
+        with pytest.raises(ValueError, match=r"found action \[\[0.0, 0.0\], \[0.0, nan\]\], expected numbers"):
+            vector.step(np.array([[0.0, 0.0], [0.0, np.nan]]))
+    assert np.isfinite(single.step(np.array([3.0, -np.inf]))[0]).all()
+    assert np.isfinite(vector.step(np.zeros((2, 2)))[0]).all()
+
+
 def test_a_given_layout() -> None:
     observation, _ = make(WANDERING).reset(options={"layout": CorridorLayout(np.int32(3))})
     assert observation[-1].argmax() == 3
@@ -224,18 +244,25 @@ def test_gymnasiums_wrappers_count_returns() -> None:
 
 
 @pytest.fixture
-def ids() -> Iterator[tuple[str, ...]]:
-    assert not [name for name in gymnasium.registry if name.startswith("hrlspec/")]  # nothing at import
-    names = hrlspec.gymnasium.register()
+def mine() -> Iterator[tuple[str, ...]]:
+    names = hrlspec.gymnasium.register("mine")
     yield names
     for name in names:
         del gymnasium.registry[name]
 
 
-def test_ids(ids: tuple[str, ...]) -> None:
-    assert "hrlspec/letter-v0" in ids
-    assert set(ids) <= set(gymnasium.registry)
-    assert hrlspec.gymnasium.register() == ids
+def test_another_namespace(mine: tuple[str, ...]) -> None:
+    assert "mine/letter-v0" in mine
+    assert set(mine) <= set(gymnasium.registry)
+    assert hrlspec.gymnasium.register("mine") == mine
+
+
+def test_ids() -> None:
+    """Known from the import on, also by the name of the module that registers them."""
+    for name in ("hrlspec/walk-v0", "hrlspec.gymnasium:hrlspec/walk-v0"):
+        assert gymnasium.make(name, task="achieve a", render_mode=None).reset(seed=0)[1]["subtasks"] == ("achieve a",)
+    with pytest.raises(TypeError, match="found render_mode 'human', expected None"):
+        gymnasium.make("hrlspec/walk-v0", render_mode="human")
     env = gymnasium.make("hrlspec/walk-v0", task="achieve a", horizon=30)
     check_env(env.unwrapped)
     assert env.reset(seed=0)[1]["subtasks"] == ("achieve a",)
@@ -249,3 +276,37 @@ def test_a_presets_name_is_enough() -> None:
     env.reset(seed=0, options={"task": "achieve a; achieve b"})
     assert env.propositions == tuple("abcde")
     assert jax.tree.leaves(env.action_space.sample())[0] in range(4)
+
+
+FORKS = """
+import functools
+import gymnasium, numpy as np
+from jax._src.xla_bridge import backends_are_initialized
+import hrlspec.gymnasium
+
+hrlspec.gymnasium.make("zone")
+hrlspec.gymnasium.make_vec("letter", 3, task=["achieve a", "achieve b", "achieve c; achieve d"])
+make = functools.partial(hrlspec.gymnasium.make, "walk", task="achieve a")
+envs = gymnasium.vector.AsyncVectorEnv([make] * 2, context="fork")
+assert not backends_are_initialized()
+assert envs.reset(seed=0)[1]["success"].tolist() == [False, False]
+assert np.isfinite(envs.step(np.zeros((2, 2), np.float32))[0]).all()
+envs.close()
+
+make().reset()
+envs = gymnasium.vector.AsyncVectorEnv([make], context="fork")
+try:
+    envs.reset()
+except RuntimeError as error:
+    assert "JAX had started in the process" in str(error), error
+else:
+    raise AssertionError("not refused")
+envs.close()
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_forks_work_before_jax_starts_and_are_refused_afterwards() -> None:
+    script = [sys.executable, "-c", FORKS]
+    ran = subprocess.run(script, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+    assert ran.returncode == 0, ran.stderr
