@@ -81,7 +81,7 @@ def _place_next(draw: _Draw, previous: Float[Array, "objects 2"]) -> _Draw:
     index = np.arange(1 + NUM_ZONES)
     key, draw_key = jax.random.split(draw.key)
     is_robot = draw.count == 0
-    reach = jnp.where(is_robot, SPAWN - ROBOT_KEEPOUT, SPAWN - ZONE_KEEPOUT)
+    reach = jnp.where(is_robot, jnp.float32(SPAWN - ROBOT_KEEPOUT), jnp.float32(SPAWN - ZONE_KEEPOUT))
     candidates = reach * jax.random.uniform(draw_key, (_BLOCK, 2), jnp.float32, -1.0, 1.0)
     # The robot comes first, so what is being placed near something else is always a zone.
     apart = np.where(index == 0, ROBOT_KEEPOUT + ZONE_KEEPOUT, 2 * ZONE_KEEPOUT)
