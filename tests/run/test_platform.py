@@ -81,8 +81,8 @@ def test_flags_at_which_xla_ends_the_process(
 
 def test_flags_in_a_file_are_taken_from_there(tmp_path: Path) -> None:
     file = tmp_path / "flags.txt"
-    file.write_text("--xla_cpu_use_fusion_emitters=true\n")
-    assert platform._flags_of_user(str(file)) == "--xla_cpu_use_fusion_emitters=true\n"
+    file.write_text("--xla_backend_optimization_level=1\n")
+    assert platform._flags_of_user(str(file)) == "--xla_backend_optimization_level=1\n"
 
 
 def test_users_without_a_home(monkeypatch: pytest.MonkeyPatch) -> None:
