@@ -86,7 +86,9 @@ def test_the_rest_of_the_page_runs(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.filterwarnings("ignore:Brax System", "ignore:Accessing `.*` directly from `Data`:DeprecationWarning")
 @pytest.mark.parametrize(
-    ("needs", "world", "train"), [("gymnax", ROOMS, TRAIN_ROOMS), ("brax", REACHER, TRAIN_REACHER)]
+    ("needs", "world", "train"),
+    [("gymnax", ROOMS, TRAIN_ROOMS), ("brax", REACHER, TRAIN_REACHER)],
+    ids=["gymnax", "brax"],
 )
 def test_worlds_of_others_are_trained(needs: str, world: str, train: str, capsys: pytest.CaptureFixture[str]) -> None:
     """As the page has it, with fewer steps and smaller sizes."""
