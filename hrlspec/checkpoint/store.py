@@ -26,6 +26,7 @@ import logging
 import os
 import re
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -260,7 +261,7 @@ def _write(folder: Path, leaves: Mapping[str, Leaf], metadata: Mapping[str, Any]
 
 def _check_room(folder: Path, size: int) -> None:
     """Raises the system's error if there is not enough room: threads of the storage would tell of theirs at length."""
-    if not hasattr(os, "posix_fallocate"):
+    if sys.platform in ("win32", "darwin"):  # which cannot be asked
         return
     with tempfile.TemporaryFile(dir=folder) as file:
         os.posix_fallocate(file.fileno(), 0, 2 * size + 2**20)

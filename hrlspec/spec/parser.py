@@ -32,27 +32,19 @@ from hrlspec.spec.syntax import (
     SpecError,
     Then,
     check,
-    shorten,
 )
+from hrlspec.spec.tokens import END, Cursor, Token
 
-_END = ""
 _BYTE_ORDER_MARK = "\ufeff"
 
 
 @dataclass(frozen=True)
-class _Token:
-    """A keyword, a punctuation mark, a name or the end of the text (empty)."""
-
-    text: str
-    position: Position
+class _Token(Token):
+    """A keyword, a punctuation mark, a name or the end."""
 
     @property
     def is_name(self) -> bool:
         return self.text not in KEYWORDS and self.text.isidentifier()
-
-    def unexpected(self, expected: str) -> SpecError:
-        found = "the end of the text" if self.text == _END else shorten(self.text)
-        return self.position.error(f"found {found}, expected {expected}")
 
 
 def parse(text: str, *, line: int = 1) -> Formula:
@@ -104,26 +96,21 @@ def _tokens(text: str, line: int) -> list[_Token]:
             tokens.append(_Token(text[start:i], position))
         elif not char.isspace():
             raise position.error(f"found {char!r}, expected a keyword, a proposition, ';', '(' or ')'")
-    tokens.append(_Token(_END, Position(line, i - line_start + 1)))
+    tokens.append(_Token(END, Position(line, i - line_start + 1)))
     return tokens
 
 
-class _Parser:
+class _Parser(Cursor[_Token]):
     """Recursive descent; recursion happens at parentheses alone, and those are counted."""
 
     def __init__(self, tokens: list[_Token]) -> None:
-        self.tokens = tokens
-        self.index = 0
+        super().__init__(tokens)
         self.nesting = 0
         # Whether a task starts at each token: the next one that is no "(" is "achieve".
         self.starts_task = [False] * len(tokens)
         for i in reversed(range(len(tokens))):
             word = tokens[i].text
             self.starts_task[i] = word == "achieve" or (word == "(" and self.starts_task[i + 1])
-
-    @property
-    def token(self) -> _Token:
-        return self.tokens[self.index]
 
     def accept(self, text: str) -> _Token | None:
         """Takes the next token if it is ``text``."""
@@ -149,10 +136,10 @@ class _Parser:
         self.nesting -= 1
 
     def whole(self) -> Formula:
-        if self.token.text == _END:
+        if self.token.text == END:
             raise self.token.unexpected("a task, such as 'achieve a; achieve b'")
         formula = self.task()
-        if self.token.text != _END:
+        if self.token.text != END:
             raise self.token.unexpected("';', 'or', 'ensuring', 'and' or the end of the text")
         return formula
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Collection, Iterable, Mapping
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Int32
 
-Status = Literal["RUNNING", "SATISFIED", "VIOLATED"]
+from hrlspec.spec.monitor import RUNNING, SATISFIED, VIOLATED
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -40,8 +39,11 @@ class Automaton:
     def _column(self) -> Mapping[frozenset[str], int]:
         return {label: column for column, label in enumerate(self.labels)}
 
-    def run(self, trace: Iterable[Collection[str]]) -> Status:
+    def run(self, trace: Iterable[Collection[str]]) -> int:
         """How the task stands after a trace: the propositions that hold after the first action, and so on.
+
+        Returns:
+            `RUNNING`, `SATISFIED` or `VIOLATED` of `hrlspec.spec`.
 
         Raises:
             ValueError: a label of the trace is impossible.
@@ -54,5 +56,5 @@ class Automaton:
                 raise ValueError(f"step {step} of the trace has the label {{{shown}}}, which cannot occur")
             state = int(self.successors[state, column])
         if state == self.accepting:
-            return "SATISFIED"
-        return "VIOLATED" if state == self.rejecting else "RUNNING"
+            return SATISFIED
+        return VIOLATED if state == self.rejecting else RUNNING

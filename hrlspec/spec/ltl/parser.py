@@ -31,9 +31,9 @@ from hrlspec.spec.ltl.syntax import (
     UnaryOperator,
     is_keyword,
 )
-from hrlspec.spec.syntax import MAX_TEXT, Position, SpecError, shorten
+from hrlspec.spec.syntax import MAX_TEXT, Position, SpecError
+from hrlspec.spec.tokens import END, Cursor, Token
 
-_END = ""
 _UNARY = "!XFG"
 _TEMPORAL = ("U", "R", "W", "M")
 _ARROWS = ("->", "<->")
@@ -42,19 +42,12 @@ _SPACE = re.compile(r"\s+")
 
 
 @dataclasses.dataclass(frozen=True)
-class _Token:
-    """An operator, a parenthesis, a constant, a name or the end of the text (empty)."""
-
-    text: str
-    position: Position
+class _Token(Token):
+    """An operator, a parenthesis, a constant, a name or the end."""
 
     @property
     def is_binary(self) -> bool:
         return self.text in ("&", "|", *_TEMPORAL, *_ARROWS)
-
-    def unexpected(self, expected: str) -> SpecError:
-        found = "the end of the text" if self.text == _END else shorten(self.text)
-        return self.position.error(f"found {found}, expected {expected}")
 
 
 def parse_ltl(text: str) -> Formula:
@@ -94,31 +87,26 @@ def _tokens(text: str) -> list[_Token]:
             tokens += [_Token(x, Position(line, position.column + k)) for k, x in enumerate(word)]
         else:
             tokens.append(_Token("->" if word == "=>" else word, position))
-    tokens.append(_Token(_END, Position(line, i - line_start + 1)))
+    tokens.append(_Token(END, Position(line, i - line_start + 1)))
     return tokens
 
 
-class _Parser:
+class _Parser(Cursor[_Token]):
     """Recursive descent; recursion happens at parentheses and unary operators, and those are counted."""
 
     def __init__(self, tokens: list[_Token]) -> None:
-        self.tokens = tokens
-        self.index = 0
+        super().__init__(tokens)
         self.depth = 0
-
-    @property
-    def token(self) -> _Token:
-        return self.tokens[self.index]
 
     def take(self) -> _Token:
         self.index += 1
         return self.tokens[self.index - 1]
 
     def whole(self) -> Formula:
-        if self.token.text == _END:
+        if self.token.text == END:
             raise self.token.unexpected("a formula, such as 'F (a & F b)'")
         formula = self.formula()
-        if self.token.text != _END:
+        if self.token.text != END:
             raise self.token.unexpected("an operator between two formulas or the end of the text")
         return formula
 

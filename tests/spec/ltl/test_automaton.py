@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from hrlspec.spec import SpecError
+from hrlspec.spec import RUNNING, SATISFIED, VIOLATED, SpecError
 from hrlspec.spec.ltl import Automaton, Formula, parse_ltl, propositions_of, satisfies_ltl, to_automaton, translate
 from hrlspec.spec.ltl.syntax import Binary, Constant, Nary, Proposition, Unary, subformulas
 from tests.spec.ltl.test_parser import PEERS
@@ -74,7 +74,7 @@ def spread(automaton: Automaton, rng: random.Random) -> list[frozenset[str]]:
     """A trace that does not decide the task at once, if there is one of three."""
     labels = automaton.labels
     traces = [[rng.choice(labels) for _ in range(rng.randrange(1, 9))] for _ in range(3)]
-    return max(traces, key=lambda trace: sum(automaton.run(trace[:n]) == "RUNNING" for n in range(len(trace))))
+    return max(traces, key=lambda trace: sum(automaton.run(trace[:n]) == RUNNING for n in range(len(trace))))
 
 
 @pytest.mark.parametrize(("count", "traces"), [(150, 8), pytest.param(2500, 40, marks=pytest.mark.slow)])
@@ -85,7 +85,7 @@ def test_an_automaton_accepts_what_satisfies_the_formula(count: int, traces: int
         for _ in range(traces):
             trace = spread(automaton, rng)
             verdicts.append(satisfies_ltl(formula, trace))
-            assert (automaton.run(trace) == "SATISFIED") == verdicts[-1], (formula, trace)
+            assert (automaton.run(trace) == SATISFIED) == verdicts[-1], (formula, trace)
     assert 0.2 < sum(verdicts) / len(verdicts) < 0.8
     with_next = sum(
         any(isinstance(x, Unary) and x.operator == "X" for x in subformulas(f)) for f, _ in random_cases(count, 0)
@@ -105,7 +105,7 @@ def test_what_is_violated_no_continuation_can_satisfy(count: int) -> None:
         more = range(automaton.num_states + 1)
         endings = itertools.chain.from_iterable(itertools.product(automaton.labels, repeat=n) for n in more)
         can_be = any(satisfies_ltl(formula, [*trace, *ending]) for ending in endings)
-        assert (automaton.run(trace) == "VIOLATED") == (not can_be), (formula, trace)
+        assert (automaton.run(trace) == VIOLATED) == (not can_be), (formula, trace)
         violated += not can_be
     assert violated > 0.1 * count
 
@@ -130,25 +130,25 @@ def test_states_are_told_apart_by_some_continuation() -> None:
 @pytest.mark.parametrize(
     ("text", "trace", "status"),
     [
-        ("F a", [], "RUNNING"),
-        ("true", [], "RUNNING"),  # nothing is accepted before the first step
-        ("true", [""], "SATISFIED"),
-        ("false", [""], "VIOLATED"),
-        ("G a", ["a"], "SATISFIED"),  # the prefix of one step satisfies it
-        ("G a", ["b", "a"], "VIOLATED"),
-        ("X a", ["a"], "RUNNING"),
-        ("X a", ["", "a"], "SATISFIED"),
-        ("!X a", ["a"], "SATISFIED"),  # there is no next step
-        ("X !a & G b", ["b", "b"], "SATISFIED"),
-        ("!a U (b & (!c U d))", ["b", "c", "b", "d"], "SATISFIED"),  # the inner until only withdraws progress
-        ("!a U (b & (!c U d))", ["b", "c", "a"], "VIOLATED"),
+        ("F a", [], RUNNING),
+        ("true", [], RUNNING),  # nothing is accepted before the first step
+        ("true", [""], SATISFIED),
+        ("false", [""], VIOLATED),
+        ("G a", ["a"], SATISFIED),  # the prefix of one step satisfies it
+        ("G a", ["b", "a"], VIOLATED),
+        ("X a", ["a"], RUNNING),
+        ("X a", ["", "a"], SATISFIED),
+        ("!X a", ["a"], SATISFIED),  # there is no next step
+        ("X !a & G b", ["b", "b"], SATISFIED),
+        ("!a U (b & (!c U d))", ["b", "c", "b", "d"], SATISFIED),  # the inner until only withdraws progress
+        ("!a U (b & (!c U d))", ["b", "c", "a"], VIOLATED),
     ],
 )
-def test_status(text: str, trace: list[str], status: str) -> None:
+def test_status(text: str, trace: list[str], status: int) -> None:
     formula = parse_ltl(text)
     automaton = to_automaton(formula, "abcd", [set(), *"abcd"])
     assert automaton.run(map(set, trace)) == status
-    assert satisfies_ltl(formula, [set(label) for label in trace]) == (status == "SATISFIED")
+    assert satisfies_ltl(formula, [set(label) for label in trace]) == (status == SATISFIED)
 
 
 def test_impossible_labels_are_refused() -> None:
