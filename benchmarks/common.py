@@ -142,8 +142,9 @@ def training(name: str, recipe: Recipe, seconds: float) -> dict[str, Any]:
     def roll(collector: Any) -> Any:
         tasks = jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank)
         book = agent.low.prepare(state.params, tasks)
-        pool = fill_pool(jax.random.key(1), agent, book, state.curriculum.level, size=config.episode_slots)
-        setting = Setting(agent, state.params, machine, book, pool)
+        envs = jnp.arange(config.num_envs, dtype=jnp.int32)
+        pool = fill_pool(jax.random.key(1), agent, book, state.curriculum.level, envs, size=config.episode_slots)
+        setting = Setting(agent, state.params, machine, book, pool, envs)
         return collect(jax.random.key(2), setting, collector, config.noise_correlation)[0]
 
     result["rollout_steps_per_s"] = rate(roll, state.collector, config.steps_per_iteration, seconds)

@@ -219,6 +219,9 @@ class Config(Checked):
     """E, environments stepped side by side."""
     num_steps: int = setting(64, least=2)
     """T, steps of a rollout."""
+    blocks: int = setting(1, least=1)
+    """G, equal parts of the environments. Each shuffles its own rows into minibatches, whose gradient is the mean over
+    the parts; devices share them evenly, and what is learned does not depend on the number of devices."""
     total_steps: int = setting(3_000_000, least=1, most=2**40)
     discount: float = setting(0.94, least=0, most=1)
     """Gamma, per environment step, at both levels."""
@@ -240,15 +243,28 @@ class Config(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        rows = self.num_envs + self.num_copies
-        check_divides("Config.low.optimiser.minibatches", self.low.optimiser, rows, "environments and copies")
+        if self.num_envs % self.blocks:
+            raise ConfigError(
+                f"Config.blocks is {self.blocks}, expected a divisor of {self.num_envs}, the number of environments"
+            )
+        of_a_block = "" if self.blocks == 1 else f" of each of {self.blocks} blocks"
+        rows = self.envs_per_block + self.copies_per_block
+        check_divides(
+            "Config.low.optimiser.minibatches", self.low.optimiser, rows, f"environments and copies{of_a_block}"
+        )
         if self.shield.enabled:
-            check_divides("Config.shield.optimiser.minibatches", self.shield.optimiser, self.num_envs, "environments")
+            what = f"environments{of_a_block}"
+            check_divides("Config.shield.optimiser.minibatches", self.shield.optimiser, self.envs_per_block, what)
 
     @property
-    def num_copies(self) -> int:
-        """Environments whose rollouts are relabelled in an iteration."""
-        return round(self.relabel.share * self.num_envs)
+    def envs_per_block(self) -> int:
+        """Environments of a block."""
+        return self.num_envs // self.blocks
+
+    @property
+    def copies_per_block(self) -> int:
+        """Environments of a block whose rollouts are relabelled in an iteration."""
+        return round(self.relabel.share * self.envs_per_block)
 
     @property
     def steps_per_iteration(self) -> int:

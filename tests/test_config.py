@@ -33,6 +33,7 @@ BOUNDS: dict[type, dict[str, tuple[float, float]]] = {
     Config: {
         "num_envs": (1, INF),
         "num_steps": (2, INF),
+        "blocks": (1, INF),
         "total_steps": (1, 2**40),
         "discount": (0, 1),
         "noise_correlation": (0, 0.999),
@@ -189,7 +190,7 @@ def test_settings_that_go_with_each_other_are_accepted() -> None:
     assert CurriculumConfig(levels=14).max_nodes == 16
     # 8 environments and 4 copies in three parts; the reach critic learns from no copies.
     low = PPOConfig(optimiser=OptimiserConfig(minibatches=3))
-    assert Config(num_envs=8, low=low).num_copies == 4
+    assert Config(num_envs=8, low=low).copies_per_block == 4
     # Without a shield nothing has to share the environments.
     assert not Config(num_envs=12, low=PPOConfig(optimiser=ONE), shield=ShieldConfig(enabled=False)).shield.enabled
 
@@ -203,7 +204,7 @@ def test_what_follows_from_the_settings() -> None:
         low=PPOConfig(optimiser=ONE),
         relabel=RelabelConfig(share=0.25),
     )
-    assert (config.num_copies, config.steps_per_iteration, config.episode_slots) == (8, 320, 3)
+    assert (config.copies_per_block, config.steps_per_iteration, config.episode_slots) == (8, 320, 3)
     assert config.num_iterations == 4  # three have 960 steps
     assert dataclasses.replace(config, steps_per_slot=50).episode_slots == 2
 

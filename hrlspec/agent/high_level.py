@@ -51,7 +51,7 @@ class Rewards(NamedTuple):
 
 
 class HighLevel(abc.ABC):
-    """Chooses sub-tasks. `init` and `choose` are what acting needs; `loss` and `observe` are how it learns."""
+    """Chooses sub-tasks. `init` and `choose` are what acting needs; the others are how it learns."""
 
     ppo: PPOConfig | None = None
     """How `loss` is descended; ``None`` where nothing is learned by gradient."""
@@ -68,8 +68,8 @@ class HighLevel(abc.ABC):
         return False
 
     def num_samples(self, config: Config) -> int:
-        """B, decisions that an iteration learns from at most."""
-        return config.steps_per_iteration
+        """B, decisions that a block learns from in an iteration, at most."""
+        return config.envs_per_block * config.num_steps
 
     def check(self, config: Config) -> None:
         """Refuses shared settings that do not go with these.
@@ -136,7 +136,15 @@ class HighLevel(abc.ABC):
         """
         raise NotImplementedError(f"{type(self).__name__} has nothing to learn by gradient")
 
-    def observe(self, params: Any, book: TaskBook, steps: Step, config: Config) -> Any:
-        """``params["high"]`` after a rollout ``[T, E]``, for what is measured rather than learned by gradient."""
+    def measure(self, book: TaskBook, steps: Step, config: Config) -> Any:
+        """What is measured in a rollout ``[T, E]`` rather than learned by gradient: a pytree of sums.
+
+        Those of all environments are added up for `observe`.
+        """
         del book, steps, config
+        return ()
+
+    def observe(self, params: Any, measured: Any) -> Any:
+        """``params["high"]`` after a rollout, from the sums of `measure`."""
+        del measured
         return params

@@ -4,7 +4,8 @@ A relabelled copy of an environment's rollout counts as one more environment, so
 and copies with the same code.
 
 Axes: **V** environments and relabelled copies, **E** environments, **T** time steps, **S** episodes (slots), **N** tree
-nodes, **P** atomic propositions, **R** rows: V·T steps one after the other.
+nodes, **P** atomic propositions, **R** rows: V·T steps one after the other, **L** blocks of environments
+(`hrlspec.learning.shards`).
 """
 
 from __future__ import annotations
@@ -38,28 +39,37 @@ def gather(
     book: TaskBook,
     steps: Step,
     reserved: UInt32[Array, " M"],
+    envs: Int32[Array, " E"],
 ) -> Experience:
-    """A rollout ``[T, E]`` and relabelled copies of a share of its environments. The key is consumed.
+    """A rollout ``[T, E]`` and relabelled copies of a share of its environments, block by block, ``[L, V, T]``.
 
     Args:
-        key: of the relabelling.
+        key: of the relabelling; consumed.
         agent: both levels.
         params: their parameters.
         machine: the rewards.
         book: the tasks of the rollout.
         steps: the rollout.
         reserved: uint32, sorted hashes of held-out tasks, which relabelling must not produce.
+        envs: int32 ``[E]``, which environments these are.
     """
     config = agent.config
     by_env = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), steps)
     parts = [originals(book, by_env, config.episode_slots)]
-    if config.num_copies:
-        offset = jax.random.randint(key, (), 0, config.num_envs, jnp.int32)
-        chosen = (offset + jnp.arange(config.num_copies, dtype=jnp.int32)) % config.num_envs
-        keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, chosen)
+    if config.copies_per_block:
+        offset = jax.random.randint(key, (), 0, config.envs_per_block, jnp.int32)
+        within = (offset + jnp.arange(config.copies_per_block, dtype=jnp.int32)) % config.envs_per_block
+        chosen = (jnp.arange(0, len(envs), config.envs_per_block, dtype=jnp.int32)[:, None] + within).reshape(-1)
+        keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, envs[chosen])
         some = jax.tree.map(lambda x: x[chosen], by_env)
         parts.append(copies(keys, agent, params, machine, book, some, reserved))
-    merged: Experience = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+
+    num_blocks = len(envs) // config.envs_per_block
+
+    def by_block(x: Shaped[Array, "rows ..."]) -> Shaped[Array, "L rows_of_block ..."]:
+        return x.reshape((num_blocks, len(x) // num_blocks, *x.shape[1:]))
+
+    merged: Experience = jax.tree.map(lambda *x: jnp.concatenate([by_block(some) for some in x], 1), *parts)
     return merged
 
 

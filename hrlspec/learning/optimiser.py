@@ -1,7 +1,11 @@
-"""Gradient descent: one guarded step, and epochs of minibatches."""
+"""Gradient descent: one guarded step, and epochs of minibatches.
+
+Axes: **L** blocks of environments on one device (`hrlspec.learning.shards`).
+"""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -13,8 +17,8 @@ from jaxtyping import Float32, Int32, Key
 from envs_jax.arrays import Array
 from hrlspec.config import OptimiserConfig
 
-Metrics = dict[str, Float32[Array, ""]]
-Loss = Callable[[Any], tuple[Float32[Array, ""], Metrics]]
+Metrics = dict[str, Float32[Array, "..."]]
+"""Float32 ``[]`` by name, or with the leading axes of whatever they were computed for."""
 
 
 def optimiser(config: OptimiserConfig) -> optax.GradientTransformation:
@@ -31,14 +35,14 @@ def annealed(first: float, last: float, progress: Float32[Array, ""]) -> Float32
 
 
 def gradient_step(
-    loss: Loss,
+    value_and_grad: Callable[[Any], tuple[tuple[Float32[Array, ""], Metrics], Any]],
     params: Any,
     state: optax.OptState,
     transform: optax.GradientTransformation,
     learning_rate: Float32[Array, ""],
 ) -> tuple[Any, optax.OptState, Metrics]:
     """One step; a non-finite loss or gradient leaves everything as it was and is counted in ``skipped``."""
-    (value, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(params)
+    (value, metrics), gradient = value_and_grad(params)
     norm = optax.tree.norm(gradient)
     finite = jnp.isfinite(norm) & jnp.isfinite(value)
     updates, new_state = transform.update(gradient, state, params)
@@ -55,17 +59,19 @@ def fit(
     batch: Any,
     config: OptimiserConfig,
     progress: Float32[Array, ""],
+    mean: Callable[[Any], Any],
 ) -> tuple[Any, optax.OptState, Metrics]:
-    """Epochs of minibatch steps over the leading axis of ``batch``, shuffled anew for each.
+    """Epochs of minibatch steps over the rows of ``batch``, shuffled anew for each, in all blocks alike.
 
     Args:
         key: consumed.
-        loss: ``(params, minibatch) -> (loss, metrics)``.
+        loss: ``(params, minibatch of a block) -> (loss, metrics)``.
         params: what is trained.
         state: of the optimiser.
-        batch: pytree, one leading axis.
+        batch: pytree, leading axes ``[L, rows]``.
         config: rate, epochs, minibatches.
         progress: float32 ``[]``, share of the training that is done.
+        mean: over blocks, of a pytree with the leading axis L; see `hrlspec.learning.shards.Shards.mean`.
 
     Returns:
         Parameters, the optimiser's state, and means of the metrics over the steps.
@@ -73,7 +79,7 @@ def fit(
     Raises:
         ValueError: if the rows do not divide into the minibatches.
     """
-    size = jax.tree.leaves(batch)[0].shape[0]
+    size = jax.tree.leaves(batch)[0].shape[1]
     if size % config.minibatches:
         raise ValueError(f"{size} rows do not divide into {config.minibatches} minibatches")
     transform = optimiser(config)
@@ -81,8 +87,14 @@ def fit(
     shuffled = jnp.argsort(jax.random.bits(key, (config.epochs, size), jnp.uint32), axis=-1).astype(jnp.int32)
 
     def step(carry: tuple[Any, Any], rows: Int32[Array, " rows"]) -> tuple[tuple[Any, Any], Metrics]:
-        sample = jax.tree.map(lambda x: x[rows], batch)
-        params, state, metrics = gradient_step(lambda p: loss(p, sample), *carry, transform, rate)
+        sample = jax.tree.map(lambda x: x[:, rows], batch)
+
+        def value_and_grad(params: Any) -> Any:
+            # One block after the other: vectorised, XLA would add up otherwise, with as many blocks in each product.
+            gradient_of = functools.partial(jax.value_and_grad(loss, has_aux=True), params)
+            return mean(jax.lax.map(gradient_of, sample))
+
+        params, state, metrics = gradient_step(value_and_grad, *carry, transform, rate)
         return (params, state), metrics
 
     rows = shuffled.reshape(config.epochs * config.minibatches, -1)

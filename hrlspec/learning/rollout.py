@@ -56,6 +56,7 @@ class Setting:
         machine: the rewards.
         book: tasks: the E running ones, then the bank, level by level.
         pool: what the next episodes start with.
+        envs: which environments these are, int32 ``[E]``; their randomness derives from it.
     """
 
     agent: Agent
@@ -63,6 +64,7 @@ class Setting:
     machine: RewardMachine
     book: TaskBook
     pool: Pool
+    envs: Int32[Array, " E"]
 
 
 class _Chance(NamedTuple):
@@ -73,7 +75,9 @@ class _Chance(NamedTuple):
     keys: Key[Array, " E"]
 
 
-def fill_pool(key: Key[Array, ""], agent: Agent, book: TaskBook, level: Int32[Array, ""], size: int) -> Pool:
+def fill_pool(
+    key: Key[Array, ""], agent: Agent, book: TaskBook, level: Int32[Array, ""], envs: Int32[Array, " E"], size: int
+) -> Pool:
     """Draws tasks of the curriculum's levels and layouts for them, ``size`` for each environment. The key is consumed.
 
     A share ``contested`` of the layouts is contested, in environments that know how to draw such layouts.
@@ -91,11 +95,11 @@ def fill_pool(key: Key[Array, ""], agent: Agent, book: TaskBook, level: Int32[Ar
         chance = jax.random.uniform(keys[size], (4, size), jnp.float32)
         levels = curriculum.draw_levels(chance[:2], level, config.earlier)
         rows = (chance[2] * config.tasks_per_level).astype(jnp.int32)
-        tasks = agent.config.num_envs + levels * config.tasks_per_level + rows
+        tasks = envs.shape[0] + levels * config.tasks_per_level + rows
         layouts = jax.vmap(draw)(keys[:size], tasks, chance[3] < config.contested)
         return Pool(layout=layouts, task=tasks, level=levels)
 
-    return jax.vmap(one)(jnp.arange(agent.config.num_envs, dtype=jnp.int32))
+    return jax.vmap(one)(envs)
 
 
 def opening(tree: TaskTree) -> tuple[Bool[Array, " P"], Bool[Array, " P"]]:
@@ -119,8 +123,8 @@ def collect(
         Where this one stopped, and its steps, leading axes ``[T, E]``.
     """
     agent, params, book = setting.agent, setting.params, setting.book
-    num_envs, num_steps = agent.config.num_envs, agent.config.num_steps
-    chance = _draw(key, agent, book.tree.num_nodes, correlation)
+    num_envs, num_steps = setting.envs.shape[0], agent.config.num_steps
+    chance = _draw(key, setting, correlation)
     last = jnp.arange(num_steps, dtype=jnp.int32) == num_steps - 1
     collector = dataclasses.replace(collector, started=jnp.zeros(num_envs, jnp.int32))
     collector, steps = jax.lax.scan(functools.partial(_step, setting), collector, (chance, last))
@@ -131,21 +135,20 @@ def collect(
     return collector, dataclasses.replace(steps, bootstrap=bootstrap)
 
 
-def _draw(key: Key[Array, ""], agent: Agent, num_nodes: int, correlation: Float32[Array, ""] | float) -> _Chance:
+def _draw(key: Key[Array, ""], setting: Setting, correlation: Float32[Array, ""] | float) -> _Chance:
     """The randomness of a rollout, leading axes ``[T, E]``."""
-    num_envs, num_steps = agent.config.num_envs, agent.config.num_steps
+    num_steps, num_nodes = setting.agent.config.num_steps, setting.book.tree.num_nodes
+    actions = setting.agent.low.actions
 
     def one(env: Int32[Array, ""]) -> _Chance:
         keys = jax.random.split(jax.random.fold_in(key, env), 3)
         return _Chance(
             jax.random.gumbel(keys[0], (num_steps, num_nodes), jnp.float32),
-            agent.low.actions.noise_sequence(keys[1], num_steps, correlation),
+            actions.noise_sequence(keys[1], num_steps, correlation),
             jax.random.split(keys[2], num_steps),
         )
 
-    chance: _Chance = jax.tree.map(
-        lambda x: jnp.swapaxes(x, 0, 1), jax.vmap(one)(jnp.arange(num_envs, dtype=jnp.int32))
-    )
+    chance: _Chance = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), jax.vmap(one)(setting.envs))
     return chance
 
 

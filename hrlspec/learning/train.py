@@ -19,13 +19,14 @@ from envs_jax.arrays import Array
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.experience import Experience, Step
 from hrlspec.agent.interaction import start
-from hrlspec.agent.low_level import Params
+from hrlspec.agent.low_level import Params, TaskBook
 from hrlspec.learning.batch import high_batch, low_batch
 from hrlspec.learning.experience import gather
 from hrlspec.learning.optimiser import Metrics, annealed, fit, optimiser
 from hrlspec.learning.ppo import low_level_loss
 from hrlspec.learning.reach import reach_batch, reach_loss
 from hrlspec.learning.rollout import Collector, Setting, collect, fill_pool
+from hrlspec.learning.shards import SPREAD, WHOLE, Shards
 from hrlspec.spec import TaskTree
 from hrlspec.tasks import curriculum
 from hrlspec.tasks.curriculum import Curriculum
@@ -63,9 +64,24 @@ class Trainer:
 
     Attributes:
         agent: environment, settings and method.
+        devices: how many to spread the environments over; it must divide the settings' ``blocks``. The results do not
+            depend on it.
+
+    Raises:
+        ConfigError: the devices do not share the blocks evenly, or there are not as many.
     """
 
     agent: Agent
+    devices: int = 1
+
+    def __post_init__(self) -> None:
+        self.shards  # noqa: B018  refuses what does not go together
+
+    @functools.cached_property
+    def shards(self) -> Shards:
+        """How the environments lie on the devices."""
+        config = self.agent.config
+        return Shards(config.num_envs, config.blocks, self.devices)
 
     @functools.partial(jax.jit, static_argnums=0)
     def init(self, key: Key[Array, ""], bank: TaskTree, machine: RewardMachine) -> TrainState:
@@ -76,7 +92,7 @@ class Trainer:
         params = self.agent.init(init_key)
         rows = jnp.arange(config.num_envs, dtype=jnp.int32) % config.curriculum.tasks_per_level
         tasks = jax.tree.map(lambda x: jnp.asarray(x)[rows], bank)
-        return TrainState(
+        state = TrainState(
             params=params,
             optimisers={name: optimiser(some).init(params[name]) for name, some in self._optimisers().items()},
             collector=self._first_collector(start_keys, params, tasks, machine),
@@ -85,6 +101,7 @@ class Trainer:
             key=key,
             iteration=jnp.int32(0),
         )
+        return self.shards.placed(state, _places(state))
 
     @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
     def iterate(
@@ -102,25 +119,35 @@ class Trainer:
             The next state and float32 metrics: ``episodes`` and ``successes`` count what ended in the rollout,
             ``returns`` is the sum of its rewards; ``violations`` and ``shielded`` per step, the level, and losses.
         """
-        agent, config = self.agent, self.agent.config
         self._check(bank)
         chex.assert_rank(reserved, 1)
         chex.assert_type(reserved, jnp.uint32)
+        places = _places(state)
+        on_each = self.shards.on_each(self._iterate, (places, WHOLE, WHOLE, WHOLE), (places, WHOLE))
+        result: tuple[TrainState, Metrics] = on_each(state, bank, machine, reserved)
+        return result
+
+    def _iterate(
+        self, state: TrainState, bank: TaskTree, machine: RewardMachine, reserved: UInt32[Array, " M"]
+    ) -> tuple[TrainState, Metrics]:
+        """The iteration on one device, with its share of the environments."""
+        agent, config, shards = self.agent, self.agent.config, self.shards
+        envs = shards.envs()
         progress = state.iteration / config.num_iterations
         keys = jax.random.split(jax.random.fold_in(state.key, state.iteration), 5)
         book = agent.low.prepare(state.params, jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank))
         collector = dataclasses.replace(
             state.collector,
-            worker=dataclasses.replace(state.collector.worker, task=jnp.arange(config.num_envs, dtype=jnp.int32)),
+            worker=dataclasses.replace(state.collector.worker, task=jnp.arange(len(envs), dtype=jnp.int32)),
         )
-        pool = fill_pool(keys[0], agent, book, state.curriculum.level, size=config.episode_slots)
+        pool = fill_pool(keys[0], agent, book, state.curriculum.level, envs, size=config.episode_slots)
         correlation = annealed(config.noise_correlation, config.final_noise_correlation, progress)
-        setting = Setting(agent, state.params, machine, book, pool)
+        setting = Setting(agent, state.params, machine, book, pool, envs)
         collector, steps = collect(keys[1], setting, collector, correlation)
         relabel_key, pick_key = jax.random.split(keys[2])
-        experience = gather(relabel_key, agent, state.params, machine, book, steps, reserved)
+        experience = gather(relabel_key, agent, state.params, machine, book, steps, reserved, envs)
         params, optimisers, losses = self._learn(keys[3], pick_key, state, experience, steps, progress)
-        params["high"] = agent.high.observe(params["high"], book, steps, config)
+        params["high"] = agent.high.observe(params["high"], self._measured(book, steps))
         new_state = TrainState(
             params=params,
             optimisers=optimisers,
@@ -130,7 +157,8 @@ class Trainer:
             key=state.key,
             iteration=state.iteration + 1,
         )
-        return new_state, losses | _summary(steps) | {"level": 1.0 + state.curriculum.level.astype(jnp.float32)}
+        level = 1.0 + state.curriculum.level.astype(jnp.float32)
+        return new_state, losses | _summary(steps, shards) | {"level": level}
 
     def _check(self, bank: TaskTree) -> None:
         """Raises ``AssertionError`` unless these are as many tasks of the size that the settings ask for."""
@@ -185,25 +213,25 @@ class Trainer:
         keys = dict(zip(("low", "high", "reach_critic"), jax.random.split(key, 3), strict=True))
         lessons: dict[str, tuple[Any, Any]] = {
             "low": (
-                low_batch(agent, experience),
+                jax.vmap(functools.partial(low_batch, agent))(experience),
                 lambda p, sample: low_level_loss(agent.low, p, sample, config.low, progress),
             )
         }
         if ppo is not None:
             lessons["high"] = (
-                high_batch(pick_key, agent, experience, ppo),
+                jax.vmap(lambda block: high_batch(pick_key, agent, block, ppo))(experience),
                 lambda p, sample: agent.high.loss(agent.low, p, sample, progress),
             )
         if config.shield.enabled:
             lessons["reach_critic"] = (
-                reach_batch(agent.low, steps),
+                jax.tree.map(self.shards.in_blocks, reach_batch(agent.low, steps)),
                 lambda p, sample: reach_loss(agent.low, p, sample),
             )
         params, optimisers, metrics = dict(state.params), dict(state.optimisers), {}
         for name, settings in self._optimisers().items():
             batch, loss = lessons[name]
             params[name], optimisers[name], result = fit(
-                keys[name], loss, params[name], optimisers[name], batch, settings, progress
+                keys[name], loss, params[name], optimisers[name], batch, settings, progress, self.shards.mean
             )
             metrics.update({f"{name}/{k}": v for k, v in result.items()})
         return params, optimisers, metrics
@@ -212,17 +240,41 @@ class Trainer:
         """The curriculum after the episodes of its level that ended in a rollout."""
         outcome = steps.outcome
         current = (outcome.terminated | outcome.truncated) & (steps.level == before.level)
-        succeeded = (current & outcome.satisfied).sum(dtype=jnp.int32)
-        return curriculum.update(before, current.sum(dtype=jnp.int32), succeeded, self.agent.config.curriculum)
+        kinds = jnp.stack([current, current & outcome.satisfied]).astype(jnp.int32)
+        episodes, successes = self.shards.total(self.shards.in_blocks(kinds.T).sum((1, 2), dtype=jnp.int32))
+        return curriculum.update(before, episodes, successes, self.agent.config.curriculum)
+
+    def _measured(self, book: TaskBook, steps: Step) -> Any:
+        """The high level's measurements, added up over all environments."""
+        blocks = jax.tree.map(lambda x: self.shards.in_blocks(jnp.swapaxes(x, 0, 1)), steps)
+
+        def one(block: Step) -> Any:
+            in_time = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), block)
+            return self.agent.high.measure(book, in_time, self.agent.config)
+
+        return jax.tree.map(self.shards.total, jax.lax.map(one, blocks))
 
 
-def _summary(steps: Step) -> Metrics:
+def _places(state: TrainState) -> TrainState:
+    """Where the leaves of a state lie: what belongs to environments is spread over the devices."""
+
+    def place(path: Any, _: Any) -> Any:
+        return SPREAD if path[0].name in ("collector", "tasks") else WHOLE
+
+    places: TrainState = jax.tree_util.tree_map_with_path(place, state)
+    return places
+
+
+def _summary(steps: Step, shards: Shards) -> Metrics:
     """Finished episodes and the sum of rewards in a rollout, and rates per step."""
     outcome = steps.outcome
-    return {
-        "episodes": (outcome.terminated | outcome.truncated).sum().astype(jnp.float32),
-        "successes": outcome.satisfied.sum().astype(jnp.float32),
-        "returns": outcome.reward.sum(),
-        "violations": (outcome.terminated & ~outcome.satisfied).mean(),
-        "shielded": steps.low.shielded.mean(),
+    sums = {
+        "episodes": outcome.terminated | outcome.truncated,
+        "successes": outcome.satisfied,
+        "returns": outcome.reward,
+        "violations": outcome.terminated & ~outcome.satisfied,
+        "shielded": steps.low.shielded,
     }
+    total = {name: shards.total(shards.in_blocks(x.T.astype(jnp.float32)).sum((1, 2))) for name, x in sums.items()}
+    num_steps = shards.num_envs * len(outcome.reward)
+    return {name: x / num_steps if name in ("violations", "shielded") else x for name, x in total.items()}

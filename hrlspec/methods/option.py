@@ -56,8 +56,7 @@ def unmeasured(num_propositions: int) -> Measurements:
     return Measurements(attempts=ones, discounted=ones, successes=both, rewards=0 * both)
 
 
-def measure(
-    known: Measurements,
+def sums(
     origin: Bool[Array, "T E O"],
     goal: Bool[Array, "T E P"],
     ended: Bool[Array, "T E"],
@@ -67,12 +66,10 @@ def measure(
     reward: Float32[Array, "T E"],
     *,
     discount: float,
-    decay: float,
 ) -> Measurements:
-    """Adds the attempts that ended in a rollout; leading axes of all arrays ``[T, E]``.
+    """The attempts that ended in a rollout; leading axes of all arrays ``[T, E]``.
 
     Args:
-        known: what was measured before.
         origin: bool ``[..., O]``, where each step's sub-task began.
         goal: bool ``[..., P]``, what it was to reach.
         ended: bool, the attempt ended with this step.
@@ -81,7 +78,6 @@ def measure(
         duration: int32, steps since the sub-task was assigned, this one included.
         reward: float32, of this step.
         discount: γ.
-        decay: factor on the weight of earlier measurements, per iteration.
     """
     origin, goal = origin.astype(jnp.float32), goal.astype(jnp.float32)
     success = ended & reached
@@ -94,10 +90,10 @@ def measure(
         return jnp.einsum("kte,teg->kg", weight, goal)
 
     return Measurements(
-        attempts=decay * known.attempts + pairs(ended.astype(jnp.float32)),
-        discounted=decay * known.discounted + pairs(success * discount ** duration.astype(jnp.float32)),
-        successes=decay * known.successes + goals(kinds),
-        rewards=decay * known.rewards + goals(kinds * reward),
+        attempts=pairs(ended.astype(jnp.float32)),
+        discounted=pairs(success * discount ** duration.astype(jnp.float32)),
+        successes=goals(kinds),
+        rewards=goals(kinds * reward),
     )
 
 
@@ -170,12 +166,11 @@ class LogicValueIteration(Checked, HighLevel):
         over = x.outcome.edge_taken | x.outcome.terminated | next_decided
         return Rewards(reached.astype(jnp.float32), over, x.outcome.truncated)
 
-    def observe(self, params: Measurements, book: TaskBook, steps: Step, config: Config) -> Measurements:
-        """Adds what the options of a rollout took and earned."""
+    def measure(self, book: TaskBook, steps: Step, config: Config) -> Measurements:
+        """What the options of a rollout took and earned."""
         outcome, edge = steps.outcome, steps.high.edge
         following = jnp.roll(steps.high.made, -1, 0).at[-1].set(False)
-        return measure(
-            params,
+        return sums(
             jax.vmap(origins)(book.tree)[steps.task, steps.state.node],
             book.tree.reach[steps.task, edge],
             outcome.edge_taken | outcome.terminated | outcome.truncated | following,
@@ -184,8 +179,11 @@ class LogicValueIteration(Checked, HighLevel):
             steps.since + 1,
             outcome.reward,
             discount=config.discount,
-            decay=self.decay,
         )
+
+    def observe(self, params: Measurements, measured: Measurements) -> Measurements:
+        """Adds it to what was measured before, whose weight decays."""
+        return jax.tree.map(lambda known, new: self.decay * known + new, params, measured)
 
 
 @dataclasses.dataclass(frozen=True)

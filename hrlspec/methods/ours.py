@@ -63,11 +63,11 @@ class ImplicitPlanner(Checked, HighLevel):
 
     def num_samples(self, config: Config) -> int:
         """See :class:`HighLevel`."""
-        return config.steps_per_iteration // self.steps_per_sample
+        return config.envs_per_block * config.num_steps // self.steps_per_sample
 
     def check(self, config: Config) -> None:
         """See :class:`HighLevel`."""
-        what = "planner samples (num_envs * num_steps / steps_per_sample)"
+        what = "planner samples (num_envs * num_steps / steps_per_sample / blocks)"
         check_divides("ImplicitPlanner.ppo.optimiser.minibatches", self.ppo.optimiser, self.num_samples(config), what)
 
     def planner(self, low: LowLevel) -> Planner:

@@ -106,7 +106,9 @@ def test_entropy_weighs_more_the_more_of_it_is_missing() -> None:
 
 def step(loss: Any, params: Any, clip: float = 1.0) -> Any:
     transform = optimiser(OptimiserConfig(max_grad_norm=clip))
-    return gradient_step(loss, params, transform.init(params), transform, jnp.float32(0.1))
+    return gradient_step(
+        jax.value_and_grad(loss, has_aux=True), params, transform.init(params), transform, jnp.float32(0.1)
+    )
 
 
 def test_gradient_step_descends() -> None:
@@ -130,7 +132,9 @@ def test_a_step_that_is_not_finite_changes_nothing(bad: float, where: str) -> No
     params = jnp.array([1.0, 2.0])
     transform = optimiser(OptimiserConfig(max_grad_norm=1.0))
     state = transform.init(params)
-    new, new_state, metrics = gradient_step(loss, params, state, transform, jnp.float32(0.1))
+    new, new_state, metrics = gradient_step(
+        jax.value_and_grad(loss, has_aux=True), params, state, transform, jnp.float32(0.1)
+    )
     assert float(metrics["skipped"]) == 1
     for a, b in zip(jax.tree.leaves((params, state)), jax.tree.leaves((new, new_state)), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -80,7 +80,8 @@ def prepare(params: Any, bank: TaskTree, key: jax.Array) -> tuple[TaskBook, Coll
 def batches(agent: Agent, key: jax.Array, params: Any, book: TaskBook, steps: Step) -> tuple[LowBatch, HighBatch]:
     """What an iteration learns from."""
     relabel_key, pick_key = jax.random.split(key)
-    experience = gather(relabel_key, agent, params, machine(), book, steps, jnp.zeros(1, jnp.uint32))
+    blocks = gather(relabel_key, agent, params, machine(), book, steps, jnp.zeros(1, jnp.uint32), jnp.arange(E))
+    experience = jax.tree.map(lambda x: x[0], blocks)
     assert agent.high.ppo is not None
     return low_batch(agent, experience), high_batch(pick_key, agent, experience, agent.high.ppo)
 
@@ -89,8 +90,9 @@ def batches(agent: Agent, key: jax.Array, params: Any, book: TaskBook, steps: St
 @chex.assert_max_traces(n=1)
 def roll(params: Any, book: TaskBook, collector: Collector, key: jax.Array) -> Rollout:
     keys = jax.random.split(key, 3)
-    pool = fill_pool(keys[0], AGENT, book, jnp.int32(LEVEL), size=12)
-    after, trajectory = collect(keys[1], Setting(AGENT, params, machine(), book, pool), collector, 0.0)
+    envs = jnp.arange(E, dtype=jnp.int32)
+    pool = fill_pool(keys[0], AGENT, book, jnp.int32(LEVEL), envs, size=12)
+    after, trajectory = collect(keys[1], Setting(AGENT, params, machine(), book, pool, envs), collector, 0.0)
     return Rollout(trajectory, *batches(AGENT, keys[2], params, book, trajectory), after)
 
 
@@ -476,8 +478,9 @@ def test_noise_is_as_correlated_as_it_is_asked_to_be() -> None:
     def actions(correlation: jax.Array) -> jax.Array:
         state = Trainer(agent).init(jax.random.key(0), bank, rewards)
         book = agent.low.prepare(state.params, jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank))
-        pool = fill_pool(jax.random.key(1), agent, book, jnp.int32(0), size=2)
-        setting = Setting(agent, state.params, rewards, book, pool)
+        envs = jnp.arange(agent.config.num_envs, dtype=jnp.int32)
+        pool = fill_pool(jax.random.key(1), agent, book, jnp.int32(0), envs, size=2)
+        setting = Setting(agent, state.params, rewards, book, pool, envs)
         return collect(jax.random.key(2), setting, state.collector, correlation)[1].low.action
 
     for correlation in (0.0, 0.9):

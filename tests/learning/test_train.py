@@ -326,7 +326,7 @@ def test_the_reach_critic_learns_the_distance() -> None:
                 return reach_loss(low, p, batch)
 
             rate = 0.02 * (1 - share_done)
-            return gradient_step(loss, params, state, transform, rate)[:2], None
+            return gradient_step(jax.value_and_grad(loss, has_aux=True), params, state, transform, rate)[:2], None
 
         (params, _), _ = jax.lax.scan(update, (params, transform.init(params)), jnp.arange(num_updates) / num_updates)
         return jax.vmap(functools.partial(best, params))(ENV.view_at(np.arange(num_cells)))

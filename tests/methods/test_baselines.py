@@ -152,9 +152,8 @@ def test_measurements_are_sums_over_attempts_that_fade() -> None:
     goal = np.eye(P, dtype=bool)[rng.integers(P, size=shape)]
     ended, reached, last = rng.random((3, *shape)) < 0.6
     duration, reward = rng.integers(1, 9, shape), rng.normal(size=shape).astype(np.float32)
-    known = option.measure(
-        option.unmeasured(P), origin, goal, ended, reached, last, duration, reward, discount=GAMMA, decay=DECAY
-    )
+    new = option.sums(origin, goal, ended, reached, last, duration, reward, discount=GAMMA)
+    known = option.LogicValueIteration(decay=DECAY).observe(option.unmeasured(P), new)
     for g in range(P):
         here = ended & goal[..., g]
         for o in range(P + 1):

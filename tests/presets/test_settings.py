@@ -113,7 +113,7 @@ def test_what_distinguishes_the_methods(name: str, recipe: Recipe) -> None:
         assert config.relabel.share > 0
         # The ablations: one thing each.
         no_er, method = preset(name).settings("no-er", recipe, reward_set)
-        assert no_er.relabel.share == no_er.num_copies == 0
+        assert no_er.relabel.share == no_er.copies_per_block == 0
         assert dataclasses.replace(no_er, relabel=config.relabel) == config
         assert method.high == ours
         myopic, method = preset(name).settings("myopic-low", recipe, reward_set)

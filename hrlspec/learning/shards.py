@@ -1,0 +1,101 @@
+"""Environments spread over devices, such that what is learned does not depend on how many there are.
+
+Environments are divided into **blocks**, whose number is a setting. A block shuffles, samples and relabels its own
+rows; a gradient is the mean over the blocks, added up in their order. A device has one or more blocks, one after the
+other in the order of their environments.
+
+Axes: **E** environments, **G** blocks, **D** devices; **L** blocks of one device.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Int32, Shaped
+
+from envs_jax.arrays import Array
+from hrlspec.config import ConfigError
+
+T = TypeVar("T")
+
+_AXIS = "shards"
+SPREAD, WHOLE = PartitionSpec(_AXIS), PartitionSpec()
+"""How an array lies: its leading axis over the devices, or all of it on each."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Shards:
+    """E environments in G blocks on D devices. Static.
+
+    Attributes:
+        num_envs: E.
+        blocks: G.
+        devices: D, the first ones that JAX has.
+
+    Raises:
+        ConfigError: the devices do not share the blocks evenly, or there are not as many.
+    """
+
+    num_envs: int
+    blocks: int = 1
+    devices: int = 1
+
+    def __post_init__(self) -> None:
+        if self.devices < 1 or self.blocks % self.devices:
+            raise ConfigError(f"devices is {self.devices}, expected a divisor of {self.blocks}, the number of blocks")
+        if self.devices > jax.device_count():
+            raise ConfigError(f"devices is {self.devices}, but JAX has {jax.device_count()}")
+
+    @functools.cached_property
+    def mesh(self) -> Mesh:
+        """The devices in a row."""
+        return Mesh(np.array(jax.devices()[: self.devices]), (_AXIS,))
+
+    def placed(self, tree: T, places: T) -> T:
+        """Arrays of a traced program, laid over the devices as the partition specs in ``places`` say."""
+        if self.devices == 1:
+            return tree
+        how = jax.tree.map(lambda place: NamedSharding(self.mesh, place), places)
+        laid: T = jax.lax.with_sharding_constraint(tree, how)
+        return laid
+
+    def on_each(self, function: Callable[..., Any], in_specs: Any, out_specs: Any) -> Callable[..., Any]:
+        """A function of what lies on one device, as one of arrays that lie on all of them."""
+        if self.devices == 1:
+            return function
+        spread: Callable[..., Any] = jax.shard_map(
+            function, mesh=self.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False
+        )
+        return spread
+
+    # What follows is meant for functions that run on each device.
+
+    def envs(self) -> Int32[Array, " E_of_device"]:
+        """Which environments this device has: their places in the order of all."""
+        here = self.num_envs // self.devices
+        first = 0 if self.devices == 1 else jax.lax.axis_index(_AXIS).astype(jnp.int32) * here
+        return first + jnp.arange(here, dtype=jnp.int32)
+
+    def in_blocks(self, x: Shaped[Array, "rows ..."]) -> Shaped[Array, "L rows_of_block ..."]:
+        """This device's rows by block."""
+        num_blocks = self.blocks // self.devices
+        return x.reshape((num_blocks, len(x) // num_blocks, *x.shape[1:]))
+
+    def total(self, x: Shaped[Array, "L ..."]) -> Shaped[Array, "..."]:
+        """The sum over all blocks, of all devices, in their order; the same to the bit on any number of devices."""
+        every = x if self.devices == 1 else jax.lax.all_gather(x, _AXIS, tiled=True)
+        return functools.reduce(jnp.add, list(every))
+
+    def mean(self, tree: Any) -> Any:
+        """The mean over all blocks of float32 arrays with the leading axis L, gathered in one transfer."""
+        restore = jax.flatten_util.ravel_pytree(jax.tree.map(lambda x: x[0], tree))[1]
+        rows = jax.vmap(lambda one: jax.flatten_util.ravel_pytree(one)[0])(tree)
+        return restore(self.total(rows) / self.blocks)
