@@ -65,6 +65,10 @@ def dotted(settings: Any, prefix: str = "") -> dict[str, Any]:
     }
 
 
+ADDED = {"config.blocks": 1}
+"""What records lack that are older than these settings, and what they would have said."""
+
+
 def effective(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Settings as a run folder keeps them, old or new, by today's names; without those of a shield that is off."""
     now = dotted(json.loads(json.dumps(settings)))
@@ -72,7 +76,7 @@ def effective(settings: Mapping[str, Any]) -> dict[str, Any]:
         now = _renamed(now)
     if not now["config.shield.enabled"]:
         now = {name: value for name, value in now.items() if not name.startswith("config.shield.")}
-    return now
+    return ADDED | now
 
 
 def _renamed(old: Mapping[str, Any]) -> dict[str, Any]:
