@@ -15,7 +15,7 @@ from hrlspec.run.platform import with_loop_option  # noqa: E402
 # Before the first array is made, so that tests and the processes they start run the same programs, to the bit. Most of
 # the tests' time is compilation: two flags shorten it, of which 0.11.1 is the first release that does not know the
 # second, and an unknown one ends the process. The caller's own come last and so prevail.
-_quick = ["--xla_backend_optimization_level=0"]
+_quick = ["--xla_force_host_platform_device_count=4", "--xla_backend_optimization_level=0"]
 if jax.__version_info__ < (0, 11, 1):
     _quick.append("--xla_cpu_use_fusion_emitters=false")
 _given = " ".join([*_quick, os.environ.get("XLA_FLAGS", "")]).strip()

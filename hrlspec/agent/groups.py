@@ -1,16 +1,16 @@
-"""Applying a costly function only to the environments that need it.
+"""Applying a function to some environments at a time: only to those that need it, or block by block.
 
-Axes: **E** environments.
+Axes: **E** environments, **L** parts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool
+from jaxtyping import Bool, Int32
 
 from envs_jax.arrays import Array
 
@@ -44,3 +44,22 @@ def in_groups(
         return waiting.at[index].set(False, mode="drop"), outputs
 
     return jax.lax.while_loop(lambda carry: carry[0].any(), body, (needed, outputs))[1]
+
+
+def one_by_one(function: Callable[[Any], Any], parts: Any) -> Any:
+    """What a function makes of each part of a pytree, leading axis L in and out, one part after the other.
+
+    Each part is computed by the same code, whatever L is, and so comes out the same to the bit. Vectorised, a matrix
+    product would have the rows of all parts and add up in another order; and of a loop that is known to end after one
+    round XLA would make other code than of a longer one.
+    """
+
+    def step(i: Int32[Array, ""], results: Any) -> Any:
+        # With the counter in the barrier, what is made of a single part does not leave the loop either.
+        i, part = jax.lax.optimization_barrier((i, jax.tree.map(lambda x: x[i], parts)))
+        return jax.tree.map(lambda all_, one: all_.at[i].set(one), results, function(part))
+
+    num_parts = jax.tree.leaves(parts)[0].shape[0]
+    shapes = jax.eval_shape(function, jax.tree.map(lambda x: x[0], parts))
+    empty = jax.tree.map(lambda x: jnp.zeros((num_parts, *x.shape), x.dtype), shapes)
+    return jax.lax.fori_loop(0, jax.lax.optimization_barrier(jnp.int32(num_parts)), step, empty)

@@ -59,7 +59,7 @@ def fit(
     batch: Any,
     config: OptimiserConfig,
     progress: Float32[Array, ""],
-    mean: Callable[[Any], Any],
+    mean_over_blocks: Callable[[Callable[[Any], Any], Any], Any],
 ) -> tuple[Any, optax.OptState, Metrics]:
     """Epochs of minibatch steps over the rows of ``batch``, shuffled anew for each, in all blocks alike.
 
@@ -71,7 +71,7 @@ def fit(
         batch: pytree, leading axes ``[L, rows]``.
         config: rate, epochs, minibatches.
         progress: float32 ``[]``, share of the training that is done.
-        mean: over blocks, of a pytree with the leading axis L; see `hrlspec.learning.shards.Shards.mean`.
+        mean_over_blocks: of what a function makes of each; see `hrlspec.learning.shards.Shards.mean`.
 
     Returns:
         Parameters, the optimiser's state, and means of the metrics over the steps.
@@ -90,9 +90,7 @@ def fit(
         sample = jax.tree.map(lambda x: x[:, rows], batch)
 
         def value_and_grad(params: Any) -> Any:
-            # One block after the other: vectorised, XLA would add up otherwise, with as many blocks in each product.
-            gradient_of = functools.partial(jax.value_and_grad(loss, has_aux=True), params)
-            return mean(jax.lax.map(gradient_of, sample))
+            return mean_over_blocks(functools.partial(jax.value_and_grad(loss, has_aux=True), params), sample)
 
         params, state, metrics = gradient_step(value_and_grad, *carry, transform, rate)
         return (params, state), metrics

@@ -19,7 +19,8 @@ from envs_jax import ContestedLayouts
 from envs_jax.arrays import Array
 from envs_jax.base import Layout
 from hrlspec.agent.agent import Agent
-from hrlspec.agent.experience import Bootstrap, HighDecision, Step, View
+from hrlspec.agent.experience import Bootstrap, HighDecision, LowDecision, Step, View
+from hrlspec.agent.groups import one_by_one
 from hrlspec.agent.interaction import Worker, act, decide, start, transition, where
 from hrlspec.agent.low_level import Params, TaskBook
 from hrlspec.spec import TaskTree
@@ -122,14 +123,14 @@ def collect(
     Returns:
         Where this one stopped, and its steps, leading axes ``[T, E]``.
     """
-    agent, params, book = setting.agent, setting.params, setting.book
+    agent = setting.agent
     num_envs, num_steps = setting.envs.shape[0], agent.config.num_steps
     chance = _draw(key, setting, correlation)
     last = jnp.arange(num_steps, dtype=jnp.int32) == num_steps - 1
     collector = dataclasses.replace(collector, started=jnp.zeros(num_envs, jnp.int32))
     collector, steps = jax.lax.scan(functools.partial(_step, setting), collector, (chance, last))
     silence = jnp.zeros((num_envs, *agent.low.actions.noise_shape), jnp.float32)
-    value = act(agent, params, book, collector.worker, silence, shield=False).value
+    value = _act(setting, collector.worker, silence, shield=False).value
     value = jnp.where(steps.outcome.truncated[-1], steps.bootstrap.low[-1], value)
     bootstrap = dataclasses.replace(steps.bootstrap, low=steps.bootstrap.low.at[-1].set(value))
     return collector, dataclasses.replace(steps, bootstrap=bootstrap)
@@ -158,7 +159,7 @@ def _step(setting: Setting, collector: Collector, inputs: tuple[_Chance, Bool[Ar
     chance, last = inputs
     before, num_envs = collector.worker, collector.level.shape[0]
     shield = agent.config.shield.enabled
-    low = act(agent, params, book, before, chance.low, shield=shield)
+    low = _act(setting, before, chance.low, shield=shield)
     step_keys, reset_keys = jax.vmap(jax.random.split, out_axes=1)(chance.keys)
     worker, outcome = transition(step_keys, agent.env, setting.machine, book, before, low.action)
     ended = outcome.terminated | outcome.truncated
@@ -187,6 +188,20 @@ def _step(setting: Setting, collector: Collector, inputs: tuple[_Chance, Bool[Ar
         since=jnp.where(after.awaiting, 0, collector.since + 1),
     )
     return collector, record
+
+
+def _act(setting: Setting, worker: Worker, noise: Float32[Array, "E ..."], *, shield: bool) -> LowDecision:
+    """Actions, block by block, so that they do not depend on how many blocks a device has."""
+    agent, rows = setting.agent, setting.agent.config.envs_per_block
+
+    def one(block: tuple[Worker, Float32[Array, "E_of_block ..."]]) -> LowDecision:
+        return act(agent, setting.params, setting.book, *block, shield=shield)
+
+    if agent.config.blocks == 1:
+        return one((worker, noise))
+    parts = jax.tree.map(lambda x: x.reshape((len(x) // rows, rows, *x.shape[1:])), (worker, noise))
+    decisions: LowDecision = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), one_by_one(one, parts))
+    return decisions
 
 
 def _plan(

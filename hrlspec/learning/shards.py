@@ -19,9 +19,10 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Int32, Shaped
+from jaxtyping import Float32, Int32, Shaped
 
 from envs_jax.arrays import Array
+from hrlspec.agent.groups import one_by_one
 from hrlspec.config import ConfigError
 
 T = TypeVar("T")
@@ -29,6 +30,11 @@ T = TypeVar("T")
 _AXIS = "shards"
 SPREAD, WHOLE = PartitionSpec(_AXIS), PartitionSpec()
 """How an array lies: its leading axis over the devices, or all of it on each."""
+
+
+def most_devices(blocks: int, available: int) -> int:
+    """How many of the available devices share so many blocks evenly."""
+    return max(devices for devices in range(1, min(blocks, available) + 1) if blocks % devices == 0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,8 +100,17 @@ class Shards:
         every = x if self.devices == 1 else jax.lax.all_gather(x, _AXIS, tiled=True)
         return functools.reduce(jnp.add, list(every))
 
-    def mean(self, tree: Any) -> Any:
-        """The mean over all blocks of float32 arrays with the leading axis L, gathered in one transfer."""
-        restore = jax.flatten_util.ravel_pytree(jax.tree.map(lambda x: x[0], tree))[1]
-        rows = jax.vmap(lambda one: jax.flatten_util.ravel_pytree(one)[0])(tree)
+    def each_block(self, function: Callable[[Any], Any], blocks: Any) -> Any:
+        """What a function makes of each block of a pytree with the leading axis L; see `one_by_one`."""
+        return one_by_one(function, blocks)
+
+    def mean(self, function: Callable[[Any], Any], blocks: Any) -> Any:
+        """The mean over all blocks of what a function makes of each, float32, gathered in one transfer."""
+        rows, restore = self._rows(function, blocks)
         return restore(self.total(rows) / self.blocks)
+
+    def _rows(self, function: Callable[[Any], Any], blocks: Any) -> tuple[Float32[Array, "L _"], Callable[[Any], Any]]:
+        """What a function makes of each block, as one row of numbers, and how to make of a row what it was."""
+        first = jax.eval_shape(function, jax.tree.map(lambda x: x[0], blocks))
+        restore = jax.flatten_util.ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), first))[1]
+        return self.each_block(lambda block: jax.flatten_util.ravel_pytree(function(block))[0], blocks), restore

@@ -124,8 +124,8 @@ class Trainer:
         chex.assert_type(reserved, jnp.uint32)
         places = _places(state)
         on_each = self.shards.on_each(self._iterate, (places, WHOLE, WHOLE, WHOLE), (places, WHOLE))
-        result: tuple[TrainState, Metrics] = on_each(state, bank, machine, reserved)
-        return result
+        new_state, metrics = on_each(state, bank, machine, reserved)
+        return self.shards.placed(new_state, places), metrics
 
     def _iterate(
         self, state: TrainState, bank: TaskTree, machine: RewardMachine, reserved: UInt32[Array, " M"]
@@ -151,7 +151,7 @@ class Trainer:
         new_state = TrainState(
             params=params,
             optimisers=optimisers,
-            collector=collector,
+            collector=dataclasses.replace(collector, worker=dataclasses.replace(collector.worker, task=envs)),
             tasks=jax.tree.map(lambda x: x[collector.worker.task], book.tree),
             curriculum=self._promoted(state.curriculum, steps),
             key=state.key,
@@ -213,13 +213,13 @@ class Trainer:
         keys = dict(zip(("low", "high", "reach_critic"), jax.random.split(key, 3), strict=True))
         lessons: dict[str, tuple[Any, Any]] = {
             "low": (
-                jax.vmap(functools.partial(low_batch, agent))(experience),
+                self.shards.each_block(functools.partial(low_batch, agent), experience),
                 lambda p, sample: low_level_loss(agent.low, p, sample, config.low, progress),
             )
         }
         if ppo is not None:
             lessons["high"] = (
-                jax.vmap(lambda block: high_batch(pick_key, agent, block, ppo))(experience),
+                self.shards.each_block(lambda block: high_batch(pick_key, agent, block, ppo), experience),
                 lambda p, sample: agent.high.loss(agent.low, p, sample, progress),
             )
         if config.shield.enabled:
@@ -252,7 +252,7 @@ class Trainer:
             in_time = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), block)
             return self.agent.high.measure(book, in_time, self.agent.config)
 
-        return jax.tree.map(self.shards.total, jax.lax.map(one, blocks))
+        return jax.tree.map(self.shards.total, self.shards.each_block(one, blocks))
 
 
 def _places(state: TrainState) -> TrainState:

@@ -66,16 +66,17 @@ class Learner:
     Args:
         experiment: what to learn.
         preset: its environment's, with test suites.
+        devices: how many train it; see `hrlspec.learning.train.Trainer`.
 
     Raises:
         UserError: no training task can be drawn under the experiment's configuration.
     """
 
-    def __init__(self, experiment: Experiment, preset: Preset) -> None:
+    def __init__(self, experiment: Experiment, preset: Preset, devices: int = 1) -> None:
         self.experiment, self.preset = experiment, preset
         self.agent = experiment.agent
         self.env = self.agent.env
-        self.trainer = Trainer(self.agent)
+        self.trainer = Trainer(self.agent, devices)
         self._init_program = self._program("init", Trainer.init)
         self._iterate_program = self._program("iterate", Trainer.iterate)
         self.machine = experiment.rewards
@@ -135,7 +136,7 @@ class Learner:
     def _program(self, name: str, function: Any) -> Program:
         """A function of the trainer; kept from run to run unless it is made of code that others may change."""
         quick, kept = self.preset.compiles_quickly(self.experiment.recipe), not self.experiment.is_foreign
-        return Program(name, function, self.trainer, quick=quick, kept=kept)
+        return Program(name, function, self.trainer, quick=quick, kept=kept, devices=self.trainer.devices)
 
     def _init(self) -> TrainState:
         key = jax.random.key(self.experiment.seed)
@@ -150,7 +151,7 @@ class Learner:
 
     def _evaluate(self, state: TrainState, env_steps: int) -> dict[str, Any]:
         key = jax.random.fold_in(self._key(_EVALUATION_STREAM), env_steps % 2**32)
-        result = self._periodic(key, self.agent, state.params, self.machine)
+        result = self._periodic(key, self.agent, on_one_device(state.params), self.machine)
         return {"level": int(state.curriculum.level) + 1, **result.metrics()}
 
     def _summarise(self, sums: Mapping[str, float], iterations: int) -> dict[str, Any]:
@@ -167,6 +168,12 @@ class Learner:
 
     def _key(self, stream: int) -> jax.Array:
         return jax.random.fold_in(jax.random.key(self.experiment.seed), 2**31 + stream)
+
+
+def on_one_device(params: Params) -> Params:
+    """Parameters that lie on every device, as arrays of the first: what uses them then runs there once."""
+    one: Params = jax.tree.map(lambda x: x.addressable_data(0), params)
+    return one
 
 
 @jax.jit

@@ -21,6 +21,7 @@ import jax
 
 from hrlspec.run.errors import UserError, in_words
 
+_HOST_DEVICES = "--xla_force_host_platform_device_count"
 _OPTIONS = "--xla_backend_extra_options="
 # The CPU backend folds the body of a small loop into one kernel, which makes rollouts several times faster. Up to JAX
 # 0.11 what it calls small is too small for them; from 0.12 on its own choice is better. No option of a program says
@@ -33,17 +34,22 @@ _SMALL_LOOPS_BYTES = 65536
 _QUICK: dict[str, str | bool] = {"xla_backend_optimization_level": "1", "xla_cpu_use_fusion_emitters": False}
 
 
-def prepare() -> None:
+def prepare(host_devices: int = 1) -> None:
     """Sets XLA's flags for this version of JAX and a compilation cache that later processes share.
 
     What the user set in ``XLA_FLAGS``, ``JAX_COMPILATION_CACHE_DIR`` and JAX's other variables stays as it is, but for
     ``JAX_ENABLE_X64``: runs compute in single precision, and are the same wherever they are started.
+
+    Args:
+        host_devices: how many devices the processor is to be, unless the user's flags say it.
 
     Raises:
         UserError: XLA would end the process because of its flags, or there is no device to compute on.
     """
     _keep_freed_memory()
     flags = _flags_of_user(os.environ.get("XLA_FLAGS", ""))
+    if host_devices > 1 and _HOST_DEVICES not in flags:
+        flags = f"{flags} {_HOST_DEVICES}={host_devices}".strip()
     os.environ["XLA_FLAGS"] = with_loop_option(flags, jax.__version_info__)
     jax.config.update("jax_enable_x64", False)
     folder = cache_folder()
@@ -134,6 +140,11 @@ def _is_known(name: str, value: str | bool) -> bool:
     except jax.errors.JaxRuntimeError:  # no such option, or not with such a value
         return False
     return True
+
+
+def num_cores() -> int:
+    """Cores of the processor that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def cache_folder() -> Path | None:

@@ -46,11 +46,14 @@ class Program:
         static: these; their ``repr`` must tell everything about them.
         quick: compiled with those `compiler_options` that take less time.
         kept: from one process to the next, if JAX's own cache is in use.
+        devices: on how many of JAX's devices it runs, the first ones.
     """
 
-    def __init__(self, name: str, function: Any, *static: Any, quick: bool = False, kept: bool = True) -> None:
+    def __init__(
+        self, name: str, function: Any, *static: Any, quick: bool = False, kept: bool = True, devices: int = 1
+    ) -> None:
         self._name, self._function, self._static = name, function, static
-        self._quick, self._kept = quick, kept
+        self._quick, self._kept, self._devices = quick, kept, devices
         self._compiled: Callable[..., Any] | None = None
 
     def __call__(self, *args: Any) -> Any:
@@ -66,7 +69,7 @@ class Program:
             return self._lower(args).compile(options)
         file = folder / f"{self._name}-{_digest(_fingerprint(), self._static, _described(args), options)}"
         with contextlib.suppress(Exception):  # not there, or damaged, or of another machine: it is made anew
-            return _load(file, args)
+            return _load(file, args, self._devices)
         lowered = self._lower(args)
         # What comes out of JAX's cache lacks code that storing it again would need; the loss shows at the first call.
         with _without_cache():
@@ -124,14 +127,16 @@ def _not_own(found: os.stat_result) -> str | None:
     return "others may write there" if found.st_mode & _OTHERS_MAY_WRITE or stat.S_ISLNK(found.st_mode) else None
 
 
-def _load(file: Path, args: tuple[Any, ...]) -> Callable[..., Any]:
+def _load(file: Path, args: tuple[Any, ...], devices: int) -> Callable[..., Any]:
     with file.open("rb") as stream:
         if reason := _not_own(os.fstat(stream.fileno())):
             raise PermissionError(reason)
         payload, result = pickle.load(stream)
     os.utime(file)
     in_tree = jax.tree.structure((args, {}))
-    program: Any = serialize_executable.deserialize_and_load(payload, in_tree, jax.tree.structure(result))
+    program: Any = serialize_executable.deserialize_and_load(
+        payload, in_tree, jax.tree.structure(result), execution_devices=jax.devices()[:devices]
+    )
     return program
 
 

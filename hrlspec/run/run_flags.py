@@ -7,7 +7,7 @@ import dataclasses
 import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
@@ -49,6 +49,9 @@ class RunFlags(Checked):
     resume: bool = False
     """Continue what is in the folder, with the flags it was begun with; finished seeds are skipped. More --total-steps
     make a run longer, finished or not."""
+    devices: int | Literal["auto"] = setting("auto", least=1)
+    """Devices to spread the environments over, a divisor of --config.blocks; those of a processor are its cores. auto:
+    as many as there are. Results do not depend on it."""
     checkpoint_minutes: float = setting(1.0, least=0, most=1e6)
     """How much work a kill may cost."""
     no_max_operator: bool = False

@@ -84,6 +84,14 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_more_devices_than_there_are_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    many = jax.device_count() + 1
+    flags = ["--config.num-envs", str(8 * many), "--config.blocks", str(many), "--devices", str(many)]
+    assert call(*tiny.arguments(tmp_path / "run", *flags)) == 2
+    assert f"--devices is {many}, but JAX has {many - 1} (cpu)" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
 def test_what_a_run_leaves(finished: Path) -> None:
     record = read_record(finished)
     assert record["config"]["config"]["num_envs"] == 8

@@ -1,4 +1,4 @@
-"""A real run that is as small as it can be with every technique on."""
+"""A real run that is as small as it can be with every technique on, on two devices."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ ITERATIONS, STEPS = 12, 80
 TOTAL = ITERATIONS * STEPS
 
 FLAGS = """
---config.num-envs 8 --config.num-steps 10 --config.group 4
+--config.num-envs 8 --config.num-steps 10 --config.group 4 --config.blocks 2
 --config.low.optimiser.epochs 1 --config.low.optimiser.minibatches 2
 --config.shield.optimiser.minibatches 2 --config.relabel.share 0.5
 --config.curriculum.levels 2 --config.curriculum.tasks-per-level 16 --config.curriculum.max-nodes 6

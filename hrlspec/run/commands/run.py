@@ -13,6 +13,7 @@ from typing import Any
 import jax
 
 from hrlspec.evaluation import SuiteResult, aggregate
+from hrlspec.learning.shards import most_devices
 from hrlspec.run import platform
 from hrlspec.run.console import PlainConsole, result_console
 from hrlspec.run.errors import UserError
@@ -28,7 +29,7 @@ from hrlspec.run.folder import (
     read_record,
     read_summary,
 )
-from hrlspec.run.learner import Learner
+from hrlspec.run.learner import Learner, on_one_device
 from hrlspec.run.loop import DivergedError, Loop, UnsavedError
 from hrlspec.run.progress import ProgressDisplay, duration
 from hrlspec.run.run_flags import RunFlags, experiments_of, parse_run, schedules_moved
@@ -52,16 +53,31 @@ def main(argv: Sequence[str], *, program: str = "hrlspec run") -> None:
     flags = parse_run(argv, program=program)
     runs = experiments_of(flags)
     resumed = _check_folders(runs, flags)
-    platform.prepare()
+    devices = _devices(flags, runs[0][0].config.blocks)
     console = result_console()
     summaries = [
-        _run(experiment, folder, resume, flags, console)
+        _run(experiment, folder, resume, devices, flags, console)
         for (experiment, folder), resume in zip(runs, resumed, strict=True)
     ]
     if len(summaries) > 1:
         results = [SuiteResult.from_json(summary["final"]["suite"]) for summary in summaries]
         name = runs[0][0].name.rpartition("-")[0]
         console.print(aggregate_table(f"{name}, seeds {flags.seed} to {runs[-1][0].seed}", aggregate(results)))
+
+
+def _devices(flags: RunFlags, blocks: int) -> int:
+    """Prepares JAX and says how many devices a run is spread over."""
+    automatic = flags.devices == "auto"
+    wanted = most_devices(blocks, platform.num_cores()) if automatic else int(flags.devices)
+    if blocks % wanted:
+        raise UserError(f"--devices is {wanted}, expected a divisor of {blocks}, the number of --config.blocks")
+    platform.prepare(host_devices=wanted)
+    available = jax.device_count()
+    if automatic:
+        return most_devices(blocks, available)
+    if wanted > available:
+        raise UserError(f"--devices is {wanted}, but JAX has {available} ({jax.default_backend()})")
+    return wanted
 
 
 def _check_folders(runs: Sequence[tuple[Experiment, Path]], flags: RunFlags) -> list[bool]:
@@ -102,7 +118,9 @@ def _results(experiment: Experiment, folder: Path) -> dict[str, Any] | None:
     return summary if summary["env_steps"] >= config.num_iterations * config.steps_per_iteration else None
 
 
-def _run(experiment: Experiment, folder: Path, resume: bool, flags: RunFlags, console: PlainConsole) -> dict[str, Any]:
+def _run(
+    experiment: Experiment, folder: Path, resume: bool, devices: int, flags: RunFlags, console: PlainConsole
+) -> dict[str, Any]:
     """One run from its beginning, or from where it was left, to its summary."""
     summary = _results(experiment, folder) if resume else None
     if summary is not None:
@@ -110,7 +128,7 @@ def _run(experiment: Experiment, folder: Path, resume: bool, flags: RunFlags, co
         return summary
     before = experiment_of(read_record(folder)["config"], str(folder)) if resume else experiment
     preset = with_tasks(experiment.preset, folder, experiment.seed)
-    learner = Learner(experiment, preset)
+    learner = Learner(experiment, preset, devices)
     with open_run(folder, experiment, resume=resume, may_change=_may_change(flags)) as run:
         for name, text in preset.texts.items():
             run.write_tasks(name, text)
@@ -128,7 +146,7 @@ def _run(experiment: Experiment, folder: Path, resume: bool, flags: RunFlags, co
         wall = loop.position.wall
         console.say(f"{experiment.name}: trained in {duration(wall)}; evaluating")
         with ended_by_signals(f"during the final evaluation; training is saved in {folder}, --resume ends it"):
-            return _finish(learner, run, state.params, total, wall, console)
+            return _finish(learner, run, on_one_device(state.params), total, wall, console)
 
 
 def _continuing(experiment: Experiment, before: Experiment, done: int) -> str:

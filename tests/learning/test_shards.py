@@ -1,0 +1,127 @@
+"""Training spread over several devices, which on a CPU are threads: the same run to the bit."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hrlspec import checkpoint
+from hrlspec.checkpoint import state_hash
+from hrlspec.config import ConfigError, evolve
+from hrlspec.learning.shards import SPREAD, WHOLE, Shards
+from hrlspec.learning.train import Trainer, TrainState
+from hrlspec.methods import METHODS
+from hrlspec.tasks.curriculum import draw_bank
+from hrlspec.tasks.rewards import reward_machine
+from tests.probes import Corridor, on_device, quick_jit, small_agent, small_config
+
+ENV = Corridor(cells=("a", "", "bc", "", "d", "", ""), starts=(1, 3, 5), horizon=9)
+# So many that a device has the environments of two groups or more: what XLA makes of smaller arrays may be rounded
+# otherwise.
+CONFIG = evolve(small_config(num_envs=128, blocks=4), {"curriculum.promotion": 0.3})
+MACHINE = reward_machine(ENV.propositions, subtask=0.5)
+ITERATIONS = 30
+DEVICES = (1, 2, 4)
+
+
+@functools.cache
+def trainer(devices: int, method: str = "ours") -> Trainer:
+    agent = small_agent(ENV, CONFIG) if method == "ours" else small_agent(ENV, CONFIG, METHODS[method])
+    return Trainer(agent, devices)
+
+
+@functools.cache
+def bank() -> Any:
+    return on_device(draw_bank(np.random.default_rng(0), CONFIG.curriculum, 4, np.zeros(0, np.uint32)))
+
+
+@functools.cache
+def programs(devices: int, method: str = "ours") -> Any:
+    """The first state and an iteration, for so many devices."""
+    some = trainer(devices, method)
+    return quick_jit(some.init), quick_jit(some.iterate)
+
+
+def trained(state: TrainState, devices: int, iterations: int, method: str = "ours") -> TrainState:
+    for _ in range(iterations):
+        state, _ = programs(devices, method)[1](state, bank(), MACHINE, jnp.zeros(0, jnp.uint32))
+    return state
+
+
+def fresh(devices: int, method: str = "ours") -> TrainState:
+    state: TrainState = programs(devices, method)[0](jax.random.key(0), bank(), MACHINE)
+    return state
+
+
+@functools.cache
+def halfway(devices: int) -> TrainState:
+    return trained(fresh(devices), devices, ITERATIONS // 2)
+
+
+@functools.cache
+def final_hash(devices: int) -> str:
+    return state_hash(trained(halfway(devices), devices, ITERATIONS - ITERATIONS // 2))
+
+
+def test_a_run_does_not_depend_on_the_number_of_devices() -> None:
+    assert int(halfway(1).curriculum.level) > 0  # and with it the counts of all devices
+    assert len({final_hash(devices) for devices in DEVICES}) == 1
+
+
+def test_what_is_measured_is_added_up_over_all_devices() -> None:
+    one, two = (trained(fresh(devices, "option"), devices, 3, "option") for devices in (1, 2))
+    assert state_hash(one) == state_hash(two)
+    assert float(one.params["high"].attempts.sum()) > 100
+
+
+@pytest.mark.parametrize(("before", "after"), [(2, 4), (4, 1), (1, 2)])
+def test_a_checkpoint_goes_on_on_another_number_of_devices(before: int, after: int, tmp_path: Path) -> None:
+    checkpoint.save(tmp_path, 1, halfway(before))
+    restored = checkpoint.load(tmp_path, fresh(after)).state
+    assert state_hash(trained(restored, after, ITERATIONS - ITERATIONS // 2)) == final_hash(1)
+
+
+def test_each_device_has_its_environments_and_all_parameters() -> None:
+    state = halfway(4)
+    assert {len(x.sharding.device_set) for x in jax.tree.leaves(state)} == {4}
+    for x in jax.tree.leaves((state.collector, state.tasks)):
+        assert [shard.data.shape[0] for shard in x.addressable_shards] == [32] * 4 or not x.size
+    for x in jax.tree.leaves((state.params, state.optimisers)):
+        assert x.is_fully_replicated
+
+
+@pytest.mark.parametrize("devices", DEVICES)
+def test_means_and_totals_are_over_all_blocks(devices: int) -> None:
+    shards = Shards(8, 4, devices)
+    rows = np.random.default_rng(0).normal(size=(8, 3)).astype(np.float32)
+
+    def on_each(x: Any) -> Any:
+        blocks = shards.in_blocks(x)
+        squares = shards.mean(lambda block: {"all": (block**2).sum(), "each": block.sum(0)}, blocks)
+        return squares, shards.total(blocks.sum((1, 2))), shards.envs()
+
+    means, total, envs = jax.jit(shards.on_each(on_each, (SPREAD,), (WHOLE, WHOLE, SPREAD)))(rows)
+    blocks = rows.reshape(4, 2, 3).astype(np.float64)
+    np.testing.assert_allclose(means["all"], (blocks**2).sum((1, 2)).mean(), rtol=1e-6)
+    np.testing.assert_allclose(means["each"], blocks.sum(1).mean(0), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(total, blocks.sum(), rtol=1e-5)
+    np.testing.assert_array_equal(envs, np.arange(8))
+
+
+@pytest.mark.parametrize(
+    ("blocks", "devices", "message"),
+    [
+        (4, 3, "devices is 3, expected a divisor of 4, the number of blocks"),
+        (1, 2, "devices is 2, expected a divisor of 1, the number of blocks"),
+        (64, 64, "devices is 64, but JAX has 4"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(blocks: int, devices: int, message: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{message}$"):
+        Shards(64, blocks, devices)
