@@ -144,7 +144,7 @@ def _is_known(name: str, value: str | bool) -> bool:
 
 def num_cores() -> int:
     """Cores of the processor that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def cache_folder() -> Path | None:

@@ -81,7 +81,7 @@ def test_without_the_physics(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    monkeypatch.setattr("hrlspec.run.platform.prepare", lambda: None)
+    monkeypatch.setattr("hrlspec.run.platform.prepare", lambda **options: None)
     assert main(["run", "--env", "zone", "--out", str(tmp_path / "here")]) == 2
     out, err = capsys.readouterr()
     assert (out, err) == ("", "error: Zone's physics needs MuJoCo and MJX: pip install 'hrlspec[zone]'\n")
