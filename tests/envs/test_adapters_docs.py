@@ -84,6 +84,7 @@ def test_the_rest_of_the_page_runs(capsys: pytest.CaptureFixture[str]) -> None:
     assert 0 <= float(success) <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Brax System", "ignore:Accessing `.*` directly from `Data`:DeprecationWarning")
 @pytest.mark.parametrize(
     ("needs", "world", "train"),

@@ -16,24 +16,23 @@ from hrlspec.evaluation.episodes import run_episodes
 from hrlspec.learning.train import Trainer, TrainState
 from hrlspec.tasks.bank import ITERATIONS_PER_BANK, TaskBanks
 from hrlspec.tasks.rewards import reward_machine
-from tests.probes import Corridor, bank_of, on_device, probe_task, quick_jit, random_params, small_agent, small_config
+from tests.probes import Corridor, bank_of, on_device, probe_task, quick_jit, random_params, small_agent
+from tests.test_api import CONFIG, HELD_OUT
 
-# No other test has this agent, whose programs it would otherwise find compiled.
-ENV = Corridor(horizon=11)
-CONFIG = small_config(num_envs=16, num_steps=8)
+ENV = Corridor()
 TRAINER = Trainer(small_agent(ENV, CONFIG))
 BANKS = TaskBanks(0, CONFIG.curriculum, ENV.num_propositions, np.zeros(0, np.uint32))
 
 once = chex.assert_max_traces(Trainer.iterate.__wrapped__, n=1)
-step = quick_jit(once, static_argnums=0, donate_argnums=1)
-"""Training as it is compiled, once for all tests of this file."""
+step = jax.jit(once, static_argnums=0, donate_argnums=1)
+"""Training as it is compiled, once for all tests of this file, and the same program as the API's tests train with."""
 
 
 def fresh() -> tuple[TrainState, Any, Any]:
     """A state, rewards, and what is reserved, on the device."""
     machine = on_device(reward_machine(ENV.propositions))
     state = quick_jit(TRAINER.init)(jax.random.key(0), BANKS.at(0), machine)
-    return state, machine, jnp.zeros(1, jnp.uint32)
+    return state, machine, jnp.zeros(len(HELD_OUT), jnp.uint32)
 
 
 def with_full_window(state: TrainState) -> TrainState:
@@ -65,7 +64,7 @@ def test_training_has_no_business_with_the_host() -> None:
         for _ in range(3):
             state, metrics = step(TRAINER, state, bank, machine, reserved)
         with pytest.raises(Exception, match="Disallowed host-to-device transfer"):
-            step(TRAINER, state, bank, machine, np.zeros(1, np.uint32))
+            step(TRAINER, state, bank, machine, np.zeros(len(HELD_OUT), np.uint32))
     assert metrics["level"] >= 1
     program = step.lower(TRAINER, fresh()[0], bank, machine, reserved).as_text()
     for word in ("callback", "infeed", "outfeed", "send", "recv"):
@@ -78,12 +77,14 @@ def test_an_evaluation_is_traced_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """For other parameters, tasks, layouts and rewards, and whatever is left for the last chunk."""
     begin = chex.assert_max_traces(episodes.start, n=1)  # called once in each program
     monkeypatch.setattr(episodes, "start", begin)
-    agent = TRAINER.agent
+    # No other test has this agent, whose programs it would otherwise find compiled.
+    env = Corridor(horizon=11)
+    agent = small_agent(env, CONFIG)
 
     def evaluate(names: list[str], seed: int, completion: float = 1.0, **how: Any) -> Any:
         trees = bank_of([probe_task(name, num_propositions=4, num_nodes=6) for name in names], 20)
-        layouts = jax.vmap(ENV.sample_layout, (0, None))(jax.random.split(jax.random.key(seed), 20), ENV.default_params)
-        machine = reward_machine(ENV.propositions, completion=completion)
+        layouts = jax.vmap(env.sample_layout, (0, None))(jax.random.split(jax.random.key(seed), 20), env.default_params)
+        machine = reward_machine(env.propositions, completion=completion)
         return run_episodes(
             jax.random.key(seed), agent, random_params(agent, seed), machine, trees, layouts, chunk=8, **how
         )

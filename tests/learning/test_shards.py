@@ -12,14 +12,16 @@ import numpy as np
 import pytest
 
 from hrlspec import checkpoint
+from hrlspec.agent.experience import Step
+from hrlspec.agent.low_level import TaskBook
 from hrlspec.checkpoint import state_hash
-from hrlspec.config import ConfigError, evolve
+from hrlspec.config import Config, ConfigError, evolve
 from hrlspec.learning.shards import SPREAD, WHOLE, Shards
 from hrlspec.learning.train import Trainer, TrainState
-from hrlspec.methods import METHODS
+from hrlspec.methods import ImplicitPlanner, Ours
 from hrlspec.tasks.curriculum import draw_bank
 from hrlspec.tasks.rewards import reward_machine
-from tests.probes import Corridor, on_device, quick_jit, small_agent, small_config
+from tests.probes import Corridor, on_device, quick_jit, small_agent, small_config, small_planner
 
 ENV = Corridor(cells=("a", "", "bc", "", "d", "", ""), starts=(1, 3, 5), horizon=9)
 # So many that a device has the environments of two groups or more: what XLA makes of smaller arrays may be rounded
@@ -27,13 +29,22 @@ ENV = Corridor(cells=("a", "", "bc", "", "d", "", ""), starts=(1, 3, 5), horizon
 CONFIG = evolve(small_config(num_envs=128, blocks=4), {"curriculum.promotion": 0.3})
 MACHINE = reward_machine(ENV.propositions, subtask=0.5)
 ITERATIONS = 30
-DEVICES = (1, 2, 4)
+
+
+class Measuring(ImplicitPlanner):
+    """Whose parameters depend on what is measured, too."""
+
+    def measure(self, book: TaskBook, steps: Step, config: Config) -> Any:
+        del book, config
+        return steps.outcome.reward.sum()
+
+    def observe(self, params: Any, measured: Any) -> Any:
+        return jax.tree.map(lambda x: x + 1e-6 * measured, params)
 
 
 @functools.cache
-def trainer(devices: int, method: str = "ours") -> Trainer:
-    agent = small_agent(ENV, CONFIG) if method == "ours" else small_agent(ENV, CONFIG, METHODS[method])
-    return Trainer(agent, devices)
+def trainer(devices: int) -> Trainer:
+    return Trainer(small_agent(ENV, CONFIG, Ours(high=Measuring(**vars(small_planner())))), devices)
 
 
 @functools.cache
@@ -42,20 +53,20 @@ def bank() -> Any:
 
 
 @functools.cache
-def programs(devices: int, method: str = "ours") -> Any:
+def programs(devices: int) -> Any:
     """The first state and an iteration, for so many devices."""
-    some = trainer(devices, method)
+    some = trainer(devices)
     return quick_jit(some.init), quick_jit(some.iterate)
 
 
-def trained(state: TrainState, devices: int, iterations: int, method: str = "ours") -> TrainState:
+def trained(state: TrainState, devices: int, iterations: int) -> TrainState:
     for _ in range(iterations):
-        state, _ = programs(devices, method)[1](state, bank(), MACHINE, jnp.zeros(0, jnp.uint32))
+        state, _ = programs(devices)[1](state, bank(), MACHINE, jnp.zeros(0, jnp.uint32))
     return state
 
 
-def fresh(devices: int, method: str = "ours") -> TrainState:
-    state: TrainState = programs(devices, method)[0](jax.random.key(0), bank(), MACHINE)
+def fresh(devices: int) -> TrainState:
+    state: TrainState = programs(devices)[0](jax.random.key(0), bank(), MACHINE)
     return state
 
 
@@ -71,16 +82,15 @@ def final_hash(devices: int) -> str:
 
 def test_a_run_does_not_depend_on_the_number_of_devices() -> None:
     assert int(halfway(1).curriculum.level) > 0  # and with it the counts of all devices
-    assert len({final_hash(devices) for devices in DEVICES}) == 1
+    assert final_hash(4) == final_hash(1)
 
 
-def test_what_is_measured_is_added_up_over_all_devices() -> None:
-    one, two = (trained(fresh(devices, "option"), devices, 3, "option") for devices in (1, 2))
-    assert state_hash(one) == state_hash(two)
-    assert float(one.params["high"].attempts.sum()) > 100
+@pytest.mark.slow  # compiling for each number of devices takes most of the time
+def test_nor_does_it_on_two() -> None:
+    assert final_hash(2) == final_hash(1)
 
 
-@pytest.mark.parametrize(("before", "after"), [(2, 4), (4, 1), (1, 2)])
+@pytest.mark.parametrize(("before", "after"), [(1, 4), (4, 1), pytest.param(2, 4, marks=pytest.mark.slow)])
 def test_a_checkpoint_goes_on_on_another_number_of_devices(before: int, after: int, tmp_path: Path) -> None:
     checkpoint.save(tmp_path, 1, halfway(before))
     restored = checkpoint.load(tmp_path, fresh(after)).state
@@ -96,7 +106,7 @@ def test_each_device_has_its_environments_and_all_parameters() -> None:
         assert x.is_fully_replicated
 
 
-@pytest.mark.parametrize("devices", DEVICES)
+@pytest.mark.parametrize("devices", [1, 2, 4])
 def test_means_and_totals_are_over_all_blocks(devices: int) -> None:
     shards = Shards(8, 4, devices)
     rows = np.random.default_rng(0).normal(size=(8, 3)).astype(np.float32)

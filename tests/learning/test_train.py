@@ -267,6 +267,7 @@ def planner_at(name: str) -> tuple[np.ndarray, np.ndarray]:
     return jax.tree.map(np.asarray, plan(ENV.view_at(np.array([1, 2, 3]))))
 
 
+@pytest.mark.slow
 def test_the_planner_picks_the_shorter_branch() -> None:
     # The smallest of the seven, over 20 seeds at three instruction sets: 0.949 ± 0.032 (standard deviation), never
     # below 0.75.

@@ -375,6 +375,7 @@ PATIENT = Patient(high=dataclasses.replace(ImplicitPlanner(), transe_margin=2.0)
 """
 
 
+@pytest.mark.slow
 def test_an_environment_and_a_method_of_somebody_elses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
