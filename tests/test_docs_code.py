@@ -19,6 +19,7 @@ MARK = re.compile(r"^<!-- test: runs(?:, with (?P<changes>[^>]*?))? -->$", re.MU
 """What a page says of its code: all of its Python runs, in order, with some numbers made smaller."""
 
 
+@pytest.mark.slow  # the README's code, which is much of it, runs by default
 @pytest.mark.parametrize("page", [name for name, text in PAGES.items() if MARK.search(text)])
 def test_marked_code_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

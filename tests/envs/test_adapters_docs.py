@@ -73,6 +73,7 @@ SMALL = {
 }
 
 
+@pytest.mark.slow
 def test_the_rest_of_the_page_runs(capsys: pytest.CaptureFixture[str]) -> None:
     """With fewer steps and smaller sizes."""
     names = {**world(), "SMALL": SMALL}
