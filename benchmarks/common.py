@@ -23,6 +23,7 @@ import numpy as np
 
 import envs_jax
 from hrlspec.agent.agent import Agent
+from hrlspec.config import evolve
 from hrlspec.learning.rollout import Setting, collect, fill_pool
 from hrlspec.learning.train import Trainer
 from hrlspec.presets import Recipe, preset
@@ -38,6 +39,8 @@ class CommonFlags:
     recipes: tuple[Recipe, ...] = ("paper", "hrlspec")
     seconds: float = 10.0
     """At least this long for each figure, compile time apart."""
+    devices: int = 1
+    """Over how many devices training is spread, in as many blocks of environments; on a CPU, threads."""
     out: Path | None = None
     """Where the JSON goes besides standard output."""
     only_start: bool = False
@@ -110,10 +113,11 @@ def environment(
     return rate(roll, (jax.random.key(1), state, observation), num_envs * num_steps, seconds)
 
 
-def learner(name: str, recipe: Recipe) -> tuple[Trainer, Any, Any]:
+def learner(name: str, recipe: Recipe, devices: int) -> tuple[Trainer, Any, Any]:
     """The paper's method with a recipe's settings, a bank of training tasks, and the rewards of set 1."""
     some = preset(name)
-    trainer = Trainer(Agent(some.make(), *some.settings("ours", recipe)))
+    config, method = some.settings("ours", recipe)
+    trainer = Trainer(Agent(some.make(), evolve(config, {"blocks": devices}), method), devices)
     nothing = np.zeros(0, np.uint32)
     banks = TaskBanks(0, trainer.agent.config.curriculum, trainer.agent.env.num_propositions, nothing)
     return trainer, banks.at(0), some.rewards()
@@ -122,13 +126,13 @@ def learner(name: str, recipe: Recipe) -> tuple[Trainer, Any, Any]:
 def programs(name: str, recipe: Recipe, trainer: Trainer) -> tuple[Program, Program]:
     """The training state and an iteration, compiled as runs do."""
     quick = preset(name).compiles_quickly(recipe)
-    init = Program("init", Trainer.init, trainer, quick=quick)
-    return init, Program("iterate", Trainer.iterate, trainer, quick=quick)
+    init = Program("init", Trainer.init, trainer, quick=quick, devices=trainer.devices)
+    return init, Program("iterate", Trainer.iterate, trainer, quick=quick, devices=trainer.devices)
 
 
-def training(name: str, recipe: Recipe, seconds: float) -> dict[str, Any]:
-    """Rollout alone, and whole iterations with every technique of the recipe, at the last curriculum level."""
-    trainer, bank, machine = learner(name, recipe)
+def training(name: str, recipe: Recipe, seconds: float, devices: int) -> dict[str, Any]:
+    """Rollout alone, on one device, and whole iterations with every technique of the recipe."""
+    trainer, bank, machine = learner(name, recipe, devices)
     agent, config = trainer.agent, trainer.agent.config
     reserved = jnp.zeros(1, jnp.uint32)
     init, iterate = programs(name, recipe, trainer)
@@ -147,7 +151,8 @@ def training(name: str, recipe: Recipe, seconds: float) -> dict[str, Any]:
         setting = Setting(agent, state.params, machine, book, pool, envs)
         return collect(jax.random.key(2), setting, collector, config.noise_correlation)[0]
 
-    result["rollout_steps_per_s"] = rate(roll, state.collector, config.steps_per_iteration, seconds)
+    if devices == 1:
+        result["rollout_steps_per_s"] = rate(roll, state.collector, config.steps_per_iteration, seconds)
     result["training_steps_per_s"] = rate(
         lambda state: iterate(state, bank, machine, reserved)[0], state, config.steps_per_iteration, seconds
     )
@@ -156,9 +161,9 @@ def training(name: str, recipe: Recipe, seconds: float) -> dict[str, Any]:
     return result
 
 
-def start(name: str, recipe: Recipe) -> dict[str, float]:
+def start(name: str, recipe: Recipe, devices: int) -> dict[str, float]:
     """Seconds that the training state took, and those that the first iteration took, in this process."""
-    trainer, bank, machine = learner(name, recipe)
+    trainer, bank, machine = learner(name, recipe, devices)
     init, iterate = programs(name, recipe, trainer)
     before = time.perf_counter()
     state = jax.block_until_ready(init(jax.random.key(0), bank, machine))
@@ -168,11 +173,12 @@ def start(name: str, recipe: Recipe) -> dict[str, float]:
     return {"init_s": between - before, "iteration_s": time.perf_counter() - between}
 
 
-def compile_times(script: str, name: str, recipe: str) -> dict[str, dict[str, float]]:
+def compile_times(script: str, name: str, recipe: str, devices: int) -> dict[str, dict[str, float]]:
     """The same start in two fresh processes: with an empty compilation cache, then with the one it left."""
     result = {}
     with tempfile.TemporaryDirectory() as cache:
         command = [sys.executable, "-m", f"benchmarks.{script}", "--env", name, "--recipes", recipe, "--only-start"]
+        command += ["--devices", str(devices)]
         environ = os.environ | {"JAX_COMPILATION_CACHE_DIR": cache}
         for which in ("cold", "warm"):
             before = time.perf_counter()
@@ -190,9 +196,9 @@ def main(script: str, env: str, flags: CommonFlags, measure: Callable[[], Mappin
         flags: what to measure.
         measure: the entries about the environment alone.
     """
-    prepare()
+    prepare(host_devices=flags.devices)
     if flags.only_start:
-        print(json.dumps(start(env, flags.recipes[0])))
+        print(json.dumps(start(env, flags.recipes[0], flags.devices)))
         return
     report: dict[str, Any] = {
         "benchmark": script,
@@ -203,12 +209,14 @@ def main(script: str, env: str, flags: CommonFlags, measure: Callable[[], Mappin
             "jaxlib": importlib.metadata.version("jaxlib"),
         },
         "device": jax.devices()[0].device_kind,
+        "devices": flags.devices,
         "cores": os.cpu_count(),
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
         **measure(),
     }
     for recipe in flags.recipes:
-        report[recipe] = {"compile": compile_times(script, env, recipe), **training(env, recipe, flags.seconds)}
+        compiled = compile_times(script, env, recipe, flags.devices)
+        report[recipe] = {"compile": compiled, **training(env, recipe, flags.seconds, flags.devices)}
     report["peak_memory_mib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     text = json.dumps(report, indent=2)
     print(text)
