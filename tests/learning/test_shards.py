@@ -1,4 +1,4 @@
-"""Training spread over several devices, which on a CPU are threads: the same run to the bit."""
+"""Training spread over several devices, which on a CPU are threads: the same run."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ from hrlspec.tasks.rewards import reward_machine
 from tests.probes import Corridor, on_device, quick_jit, small_agent, small_config, small_planner
 
 ENV = Corridor(cells=("a", "", "bc", "", "d", "", ""), starts=(1, 3, 5), horizon=9)
-# So many that a device has the environments of two groups or more: what XLA makes of smaller arrays may be rounded
-# otherwise.
+# So many that one of four devices has 32 in groups of 8: with 16, JAX 0.10.2 rounds otherwise.
 CONFIG = evolve(small_config(num_envs=128, blocks=4), {"curriculum.promotion": 0.3})
 MACHINE = reward_machine(ENV.propositions, subtask=0.5)
 ITERATIONS = 30
@@ -71,11 +70,6 @@ def fresh(devices: int) -> TrainState:
     return state
 
 
-@functools.cache
-def halfway(devices: int) -> TrainState:
-    return trained(fresh(devices), devices, ITERATIONS // 2)
-
-
 def moved(state: TrainState, devices: int) -> TrainState:
     """The same state on so many devices."""
     there: TrainState = jax.tree.map(lambda x, like: jax.device_put(x, like.sharding), state, fresh(devices))
@@ -105,7 +99,7 @@ def test_an_iteration_does_not_depend_on_the_number_of_devices() -> None:
 @pytest.mark.skipif(jax.__version_info__ < (0, 10, 2), reason="XLA adds up a bias's gradient in another order")
 @pytest.mark.parametrize("devices", [2, 4])
 def test_nor_does_a_run_to_the_bit(devices: int) -> None:
-    hashes = [state_hash(trained(halfway(n), n, ITERATIONS - ITERATIONS // 2)) for n in (1, devices)]
+    hashes = [state_hash(trained(fresh(n), n, ITERATIONS)) for n in (1, devices)]
     assert hashes[0] == hashes[1]
 
 
