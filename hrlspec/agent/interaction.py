@@ -1,7 +1,7 @@
 """One step of the agent in its world: decide where a sub-task ended, act, advance the task, reward.
 
 Shared by training and evaluation. Axes: **E** environments, **M** tasks of the book, **N** tree nodes, **P**
-atomic propositions, **R** bonus rules.
+atomic propositions, **K** candidate actions, **R** bonus rules.
 """
 
 from __future__ import annotations
@@ -121,15 +121,31 @@ def assign(agent: Agent, params: Params, book: TaskBook, worker: Worker, noise: 
 
 
 def act(
-    agent: Agent, params: Params, book: TaskBook, worker: Worker, noise: Float32[Array, "E ..."], *, shield: bool
+    agent: Agent,
+    params: Params,
+    book: TaskBook,
+    worker: Worker,
+    noise: Float32[Array, "E ..."],
+    reach_values: Float32[Array, "E P K"] | None,
 ) -> LowDecision:
-    """Chooses actions for the sub-tasks in force, leading axis E."""
+    """Chooses actions for the sub-tasks in force, leading axis E.
+
+    Args:
+        agent: both levels.
+        params: their parameters.
+        book: the tasks.
+        worker: the environments.
+        noise: of the actions; zeros choose the mode.
+        reach_values: Q(s, g, a) of what is seen, for the shield, float32 ``[E, P, K]``; ``None`` for no shield.
+    """
     low = agent.low
 
-    def one(view: View, instruction: Instruction, noise: Float32[Array, "*_"]) -> LowDecision:
+    def one(
+        view: View, instruction: Instruction, noise: Float32[Array, "*_"], reach: Float32[Array, "P K"] | None
+    ) -> LowDecision:
         outputs, value = low.control(params, view, instruction)
         action, log_prob = low.actions.sample(outputs, noise)
-        safe = shielded_action(low, params, view, instruction.avoid > 0, action) if shield else action
+        safe = action if reach is None else shielded_action(low, reach, instruction.avoid > 0, action)
         return LowDecision(action=safe, log_prob=log_prob, value=value, shielded=(safe != action).any())
 
     feasible = jax.vmap(open_edges)(task_of(book, worker.task), worker.task_state)
@@ -137,7 +153,7 @@ def act(
     instructions = low.instructions_at(
         params, book.instructions, (worker.task,), decision.edge, feasible, decision.ahead
     )
-    return jax.vmap(one)(worker.view, instructions, noise)
+    return jax.vmap(one)(worker.view, instructions, noise, reach_values)
 
 
 def transition(

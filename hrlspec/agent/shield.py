@@ -1,6 +1,6 @@
 """The shield: no action that would step on a forbidden proposition (paper, "Avoiding Propositions").
 
-Axes: **P** atomic propositions, **A** components of an action.
+Axes: **P** atomic propositions, **K** candidate actions, **A** components of an action.
 """
 
 from __future__ import annotations
@@ -9,14 +9,12 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float32, Int32
 
 from envs_jax.arrays import Array
-from hrlspec.agent.experience import View
-from hrlspec.agent.low_level import LowLevel, Params
+from hrlspec.agent.low_level import LowLevel
 
 
 def shielded_action(
     low: LowLevel,
-    params: Params,
-    view: View,
+    reach_values: Float32[Array, "P K"],
     avoid: Bool[Array, " P"],
     action: Int32[Array, ""] | Float32[Array, " A"],
 ) -> Int32[Array, ""] | Float32[Array, " A"]:
@@ -27,12 +25,11 @@ def shielded_action(
 
     Args:
         low: the networks.
-        params: their parameters.
-        view: one observation.
+        reach_values: float32 ``[P, K]``, Q(s, g, a) of each proposition and candidate action.
         avoid: bool ``[P]``, p₋ of the sub-task in force.
         action: int32 ``[]`` or float32 ``[A]``, what the policy drew.
     """
-    values = jnp.where(avoid[:, None], low.reach_values(params, view), 0.0)
+    values = jnp.where(avoid[:, None], reach_values, 0.0)
     danger = values.max(-1)
     nearest = jnp.argmax(danger)
     safest = low.actions.candidates()[jnp.argmin(values[nearest])]

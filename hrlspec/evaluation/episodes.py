@@ -144,7 +144,8 @@ def _run(
         noise = noise_scale * jax.random.gumbel(plan_key, (num_episodes, num_nodes), jnp.float32)
         worker = assign(agent, params, book, worker, noise)
         noise = noise_scale * agent.low.actions.noise(act_key, (num_episodes,))
-        action = act(agent, params, book, worker, noise, shield=shield).action
+        reach = jax.vmap(agent.low.reach_values, (None, 0))(params, worker.view) if shield else None
+        action = act(agent, params, book, worker, noise, reach).action
         seen = Trace(worker.env_state, worker.task_state.node, worker.decision.edge, running)
         worker, result = transition(jax.random.split(step_key, num_episodes), env, machine, book, worker, action)
         outcome = Episodes(

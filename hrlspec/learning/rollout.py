@@ -20,7 +20,7 @@ from envs_jax.arrays import Array
 from envs_jax.base import Layout
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.experience import Bootstrap, HighDecision, LowDecision, Step, View
-from hrlspec.agent.groups import one_by_one
+from hrlspec.agent.groups import in_groups, one_by_one
 from hrlspec.agent.interaction import Worker, act, decide, start, transition, where
 from hrlspec.agent.low_level import Params, TaskBook
 from hrlspec.spec import TaskTree
@@ -128,9 +128,10 @@ def collect(
     chance = _draw(key, setting, correlation)
     last = jnp.arange(num_steps, dtype=jnp.int32) == num_steps - 1
     collector = dataclasses.replace(collector, started=jnp.zeros(num_envs, jnp.int32))
-    collector, steps = jax.lax.scan(functools.partial(_step, setting), collector, (chance, last))
+    reach = _reach_values(setting, collector.worker.view)
+    (collector, _), steps = jax.lax.scan(functools.partial(_step, setting), (collector, reach), (chance, last))
     silence = jnp.zeros((num_envs, *agent.low.actions.noise_shape), jnp.float32)
-    value = _act(setting, collector.worker, silence, shield=False).value
+    value = _act(setting, collector.worker, silence, None).value
     value = jnp.where(steps.outcome.truncated[-1], steps.bootstrap.low[-1], value)
     bootstrap = dataclasses.replace(steps.bootstrap, low=steps.bootstrap.low.at[-1].set(value))
     return collector, dataclasses.replace(steps, bootstrap=bootstrap)
@@ -153,13 +154,18 @@ def _draw(key: Key[Array, ""], setting: Setting, correlation: Float32[Array, ""]
     return chance
 
 
-def _step(setting: Setting, collector: Collector, inputs: tuple[_Chance, Bool[Array, ""]]) -> tuple[Collector, Step]:
+_Reach = Float32[Array, "E P K"] | None
+"""Q(s, g, a) of the states that the next action is taken in; ``None`` without a shield."""
+
+
+def _step(
+    setting: Setting, carry: tuple[Collector, _Reach], inputs: tuple[_Chance, Bool[Array, ""]]
+) -> tuple[tuple[Collector, _Reach], Step]:
     """One step of all environments: act, step the worlds, restart what ended, decide what is due."""
-    agent, params, book, pool = setting.agent, setting.params, setting.book, setting.pool
-    chance, last = inputs
+    agent, book, pool = setting.agent, setting.book, setting.pool
+    (collector, reach), (chance, last) = carry, inputs
     before, num_envs = collector.worker, collector.level.shape[0]
-    shield = agent.config.shield.enabled
-    low = _act(setting, before, chance.low, shield=shield)
+    low = _act(setting, before, chance.low, reach)
     step_keys, reset_keys = jax.vmap(jax.random.split, out_axes=1)(chance.keys)
     worker, outcome = transition(step_keys, agent.env, setting.machine, book, before, low.action)
     ended = outcome.terminated | outcome.truncated
@@ -167,6 +173,7 @@ def _step(setting: Setting, collector: Collector, inputs: tuple[_Chance, Bool[Ar
     fresh = jax.tree.map(lambda x: x[jnp.arange(num_envs, dtype=jnp.int32), started % pool.task.shape[1]], pool)
     begun = start(reset_keys, agent.env, setting.machine, book, fresh.layout, fresh.task)
     after = where(ended, begun, worker)
+    reached = _reach_values(setting, worker.view)
     decision, bootstrap = _plan(setting, after, worker, outcome.truncated, last, chance.high)
     record = Step(
         view=before.view,
@@ -179,7 +186,7 @@ def _step(setting: Setting, collector: Collector, inputs: tuple[_Chance, Bool[Ar
         low=low,
         outcome=outcome,
         bootstrap=Bootstrap(low=bootstrap, high=bootstrap),
-        reach_value=_reach_values(agent, params, worker.view) if shield else jnp.zeros((num_envs, 0), jnp.float32),
+        reach_value=jnp.zeros((num_envs, 0), jnp.float32) if reached is None else reached.max(-1),
     )
     collector = Collector(
         worker=dataclasses.replace(after, decision=decision, awaiting=jnp.zeros(num_envs, bool)),
@@ -187,19 +194,22 @@ def _step(setting: Setting, collector: Collector, inputs: tuple[_Chance, Bool[Ar
         started=started,
         since=jnp.where(after.awaiting, 0, collector.since + 1),
     )
-    return collector, record
+    if reached is not None:  # of the state that the next action is taken in: another one where an episode began
+        few = agent.config.group
+        reached = in_groups(lambda view: _reach_values(setting, view), ended, after.view, reached, few)
+    return (collector, reached), record
 
 
-def _act(setting: Setting, worker: Worker, noise: Float32[Array, "E ..."], *, shield: bool) -> LowDecision:
+def _act(setting: Setting, worker: Worker, noise: Float32[Array, "E ..."], reach: _Reach) -> LowDecision:
     """Actions, block by block, so that they do not depend on how many blocks a device has."""
     agent, rows = setting.agent, setting.agent.config.envs_per_block
 
-    def one(block: tuple[Worker, Float32[Array, "E_of_block ..."]]) -> LowDecision:
-        return act(agent, setting.params, setting.book, *block, shield=shield)
+    def one(block: tuple[Worker, Float32[Array, "E_of_block ..."], _Reach]) -> LowDecision:
+        return act(agent, setting.params, setting.book, *block)
 
     if agent.config.blocks == 1:
-        return one((worker, noise))
-    parts = jax.tree.map(lambda x: x.reshape((len(x) // rows, rows, *x.shape[1:])), (worker, noise))
+        return one((worker, noise, reach))
+    parts = jax.tree.map(lambda x: x.reshape((len(x) // rows, rows, *x.shape[1:])), (worker, noise, reach))
     decisions: LowDecision = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), one_by_one(one, parts))
     return decisions
 
@@ -234,6 +244,9 @@ def _plan(
     return decision, bootstrap
 
 
-def _reach_values(agent: Agent, params: Params, view: View) -> Float32[Array, "E P"]:
-    """max_a Q(s, g, a) of each environment and proposition, float32 ``[E, P]``."""
-    return jax.vmap(agent.low.reach_values, in_axes=(None, 0))(params, view).max(-1)
+def _reach_values(setting: Setting, view: View) -> _Reach:
+    """Q(s, g, a) of what is seen, where there is a shield."""
+    if not setting.agent.config.shield.enabled:
+        return None
+    values: Float32[Array, "E P K"] = jax.vmap(setting.agent.low.reach_values, (None, 0))(setting.params, view)
+    return values

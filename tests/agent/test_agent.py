@@ -64,7 +64,7 @@ def test_shield_follows_its_rule() -> None:
     low = Scripted(Corridor(), small_config(), "future", follows_plan=False)
 
     def act(q: jax.Array, avoid: jax.Array, action: jax.Array) -> jax.Array:
-        return shielded_action(low, {}, View(q, jnp.zeros(0)), avoid, action)
+        return shielded_action(low, low.reach_values({}, View(q, jnp.zeros(0))), avoid, action)
 
     compiled = quick_jit(jax.vmap(act))
     q, avoid = rng.random((500, P, A)) ** 0.3, rng.random((500, P)) < 0.3

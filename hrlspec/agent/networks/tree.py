@@ -25,23 +25,21 @@ def sum_to_parents(
     return jnp.zeros_like(messages).at[parent].add(jnp.where(sends[:, None], messages, 0.0))
 
 
-def sweep_up(visit: Callable[..., Any], module: nn.Module, carry: Any) -> Any:
+def sweep_up(visit: Callable[..., Any], carry: Any) -> Any:
     """Visits the nodes from the last to the root, so that children come before their parents.
 
     The messages of a node are then complete when it is visited: one visit a node does what as many rounds as
     the tree is deep would do, at a fraction of the arithmetic, and look-ahead has no limit.
 
     Args:
-        visit: ``(module, carry, node) -> (carry, output)``; ``carry`` holds the messages, leading axis N.
-        module: whose parameters ``visit`` uses.
+        visit: ``(carry, node) -> (carry, output)``; ``carry`` holds the messages, leading axis N.
         carry: messages before the first visit.
 
     Returns:
         The outputs, leading axis N.
     """
     num_nodes = jax.tree.leaves(carry)[0].shape[0]
-    scan = nn.scan(visit, variable_broadcast="params", split_rngs={"params": False}, reverse=True)
-    return scan(module, carry, jnp.arange(num_nodes, dtype=jnp.int32))[1]
+    return jax.lax.scan(visit, carry, jnp.arange(num_nodes, dtype=jnp.int32), reverse=True)[1]
 
 
 def lookahead(tree: TaskTree, depth: int) -> Bool[Array, "N D P"]:
@@ -103,7 +101,7 @@ class TaskEmbedding(nn.Module):
     def setup(self) -> None:
         """Declares the weights: of a node's own features, and of the message along an edge."""
         self.own = nn.Dense(self.features, kernel_init=initializer(1.0))
-        self.message = nn.Dense(self.features, use_bias=False, kernel_init=initializer(1.0))
+        self.message = self.param("message", initializer(1.0), (self.features, self.features))
         self.edge = nn.Dense(self.features, use_bias=False, kernel_init=initializer(1.0))
 
     def __call__(self, tree: TaskTree) -> Float32[Array, "N F"]:
@@ -114,7 +112,7 @@ class TaskEmbedding(nn.Module):
         edge = self._edge(tree)
         x = jnp.zeros((tree.num_nodes, self.features), jnp.float32)
         for _ in range(self.rounds):
-            x = nn.tanh(self.own(x) + sum_to_parents(nn.tanh(self.message(x) + edge), tree.parent, sends))
+            x = nn.tanh(self.own(x) + sum_to_parents(nn.tanh(x @ self.message + edge), tree.parent, sends))
         return x
 
     def messages(self, tree: TaskTree) -> Float32[Array, "N F"]:
@@ -138,19 +136,17 @@ class TaskEmbedding(nn.Module):
         nothing = jnp.zeros((tree.num_nodes, self.features), jnp.float32)
         bias = self.own(nothing[0])
 
-        def visit(
-            module: TaskEmbedding, incoming: Float32[Array, "N F"], node: Int32[Array, ""]
-        ) -> tuple[Float32[Array, "N F"], Any]:
+        def visit(incoming: Float32[Array, "N F"], node: Int32[Array, ""]) -> tuple[Float32[Array, "N F"], Any]:
             here = nn.tanh(bias + incoming[node])
-            sent = nn.tanh(module.message(here) + edge[node]) * sends[node]
+            sent = nn.tanh(here @ self.message + edge[node]) * sends[node]
             return incoming.at[tree.parent[node]].add(sent), (here, sent)
 
-        return sweep_up(visit, self, nothing)
+        return sweep_up(visit, nothing)
 
     def of_sequence(self, ahead: Float32[Array, "D P"]) -> Float32[Array, " F"]:
         """Embeds a sequence of sub-tasks as the sweep would, ``[F]``; p₊ is ``[D, P]``, empty rows after its end."""
         bias = self.own(jnp.zeros(self.features, jnp.float32))
         x = nn.tanh(bias)
         for reach in ahead[::-1]:
-            x = nn.tanh(bias + reach.any() * nn.tanh(self.message(x) + self.edge(reach)))
+            x = nn.tanh(bias + reach.any() * nn.tanh(x @ self.message + self.edge(reach)))
         return x
