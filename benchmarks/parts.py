@@ -135,11 +135,11 @@ def parts(name: str, recipe: Recipe, iterations: int, seconds: float) -> dict[st
         book, worker, decision.action,
     )  # fmt: skip
     mean_due = float(np.asarray(steps.high.made).sum(1).mean())
-    for part, number in (("due", round(mean_due)), ("all", config.num_envs)):
+    for part, due, valued in (("due", envs < round(mean_due), envs < 0), ("valued, all", envs < 0, envs >= 0)):
         timed(
             f"step: decide, {part}",
-            lambda params, book, worker, needed: decide(agent, params, book, worker, needed, silence),
-            state.params, book, worker, envs < number,
+            lambda params, book, worker, *which: decide(agent, params, book, worker, which[0], silence, which[1]),
+            state.params, book, worker, due, valued,
         )  # fmt: skip
     report["decisions a step"] = round(mean_due, 1)
     report["level"] = int(state.curriculum.level) + 1

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Bool, Float32, Int32
+from jaxtyping import Bool, Float32, Int32, Shaped
 
 from envs_jax import Environment
 from envs_jax.arrays import Array
@@ -88,6 +88,11 @@ class Step:
 def view_of(env: Environment, observation: Float32[Array, "..."]) -> View:
     """The view of one observation."""
     return View(*env.proposition_view(observation))
+
+
+def flat(x: Shaped[Array, "V T ..."]) -> Shaped[Array, "..."]:
+    """Merges the two leading axes (zero-sized arrays too)."""
+    return x.reshape((x.shape[0] * x.shape[1], *x.shape[2:]))
 
 
 def undecided(num_envs: int, num_nodes: int, ahead_shape: tuple[int, ...]) -> HighDecision:

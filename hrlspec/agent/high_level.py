@@ -12,15 +12,17 @@ from __future__ import annotations
 import abc
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Bool, Float32, Key
+from jaxtyping import Bool, Float32, Int32, Key
 
 from envs_jax.arrays import Array
 from hrlspec.agent.experience import Experience, HighBatch, Step, View
 from hrlspec.agent.low_level import LowLevel, Params, TaskBook
 from hrlspec.agent.networks.controller import Instruction
 from hrlspec.config import Config, PPOConfig
-from hrlspec.spec import TaskState, TaskTree
+from hrlspec.spec import TaskState, TaskTree, open_edges
 
 Metrics = dict[str, Float32[Array, ""]]
 
@@ -79,6 +81,11 @@ class HighLevel(abc.ABC):
         """
         del config
 
+    @property
+    def uses_values(self) -> bool:
+        """Whether V^h at decisions is learned from."""
+        return self.ppo is not None or self.max_operator
+
     @abc.abstractmethod
     def init(self, key: Key[Array, ""], low: LowLevel, view: View, tree: TaskTree) -> Any:
         """What ``params["high"]`` begins as: where `ppo` is given, standard deviations of the weights to be drawn.
@@ -105,6 +112,21 @@ class HighLevel(abc.ABC):
             instructions: the instruction for each edge, leading axes ``[B, N]``.
         """
 
+    def settled(self, tree: TaskTree, state: TaskState, forks: Bool[Array, "B N"]) -> Int32[Array, " B"]:
+        """The edge to take where there is nothing to choose, so that `choose` need not be asked; else ``NO_NODE``.
+
+        There is nothing to choose where one edge is open and, where a plan is wanted, one way leads on from it.
+
+        Args:
+            tree: the tasks.
+            state: where they stand.
+            forks: as in a `TaskBook`.
+        """
+        feasible = jax.vmap(open_edges)(tree, state)
+        only = feasible.argmax(-1).astype(jnp.int32)
+        several = self.follows_plan & jnp.take_along_axis(forks, only[:, None], 1)[:, 0]
+        return jnp.where((feasible.sum(-1) == 1) & ~several, only, TaskTree.NO_NODE)
+
     def judge(
         self,
         low: LowLevel,
@@ -115,6 +137,21 @@ class HighLevel(abc.ABC):
         instructions: Instruction,
     ) -> Judgement:
         """What it thinks of relabelled tasks, where the choice was not its own."""
+        choice = self.choose(low, params, view, tree, state, instructions)
+        return Judgement(choice.value, choice.advice)
+
+    def judge_settled(
+        self,
+        low: LowLevel,
+        params: Params,
+        view: View,
+        tree: TaskTree,
+        state: TaskState,
+        instructions: Instruction,
+        worth: Float32[Array, " B"],
+    ) -> Judgement:
+        """What it thinks where there is nothing to choose; ``worth`` is V^l of the one way there is."""
+        del worth
         choice = self.choose(low, params, view, tree, state, instructions)
         return Judgement(choice.value, choice.advice)
 

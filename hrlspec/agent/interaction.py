@@ -85,18 +85,22 @@ def decide(
     params: Params,
     book: TaskBook,
     worker: Worker,
-    needed: Bool[Array, " E"],
+    due: Bool[Array, " E"],
     noise: Float32[Array, "E N"],
+    valued: Bool[Array, " E"] | bool = False,
 ) -> HighDecision:
-    """What the high level decides in the environments that need it, and in the others what is in force there.
+    """What the high level decides in the environments where that is due, and in the others what is in force there.
+
+    Where there is nothing to choose the high level is not asked: value and advice are zeros unless ``valued``.
 
     Args:
         agent: both levels.
         params: their parameters.
         book: the tasks.
         worker: the environments.
-        needed: bool ``[E]``.
+        due: bool ``[E]``.
         noise: Gumbel noise ``[E, N]``; zeros choose greedily.
+        valued: bool ``[E]``, V^h is wanted, whether or not a decision is due.
     """
 
     def choose(inputs: tuple[View, Int[Array, " B"], TaskState, Float32[Array, "B N"]]) -> HighDecision:
@@ -107,11 +111,14 @@ def decide(
         ahead = choice.ahead[jnp.arange(edge.shape[0], dtype=jnp.int32), edge]
         return HighDecision(jnp.ones(edge.shape, bool), edge, ahead, log_prob, choice.value, choice.advice)
 
-    before = worker.decision
-    nothing = undecided(needed.shape[0], noise.shape[-1], before.ahead.shape[1:])
-    kept = dataclasses.replace(nothing, edge=before.edge, ahead=before.ahead)
-    inputs = (worker.view, worker.task, worker.task_state, noise)
-    return in_groups(choose, needed, inputs, kept, agent.config.group)
+    before, task = worker.decision, worker.task
+    settled = agent.high.settled(task_of(book, task), worker.task_state, book.forks[task])
+    obvious = due & (settled != TaskTree.NO_NODE)
+    nothing = undecided(due.shape[0], noise.shape[-1], before.ahead.shape[1:])
+    ahead = jnp.where(obvious[:, None, None], book.instructions.ahead[task, settled], before.ahead)
+    kept = dataclasses.replace(nothing, made=obvious, edge=jnp.where(obvious, settled, before.edge), ahead=ahead)
+    inputs = (worker.view, task, worker.task_state, noise)
+    return in_groups(choose, valued | (due & ~obvious), inputs, kept, agent.config.group)
 
 
 def assign(agent: Agent, params: Params, book: TaskBook, worker: Worker, noise: Float32[Array, "E N"]) -> Worker:

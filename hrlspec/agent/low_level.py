@@ -21,6 +21,7 @@ from hrlspec.agent.distributions import Distribution, distribution_over
 from hrlspec.agent.experience import View
 from hrlspec.agent.networks.controller import Controller, Instruction, Sees
 from hrlspec.agent.networks.reach_critic import ReachCritic
+from hrlspec.agent.networks.tree import forks
 from hrlspec.config import Config
 from hrlspec.spec import TaskTree
 
@@ -35,10 +36,12 @@ class TaskBook:
     Attributes:
         tree: the tasks, leading axis M.
         instructions: the instruction for each edge, leading axes ``[M, N]``.
+        forks: bool ``[M, N]``, more than one way leads on from the node or from one below it.
     """
 
     tree: TaskTree
     instructions: Instruction
+    forks: Bool[Array, "*lead N"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +87,8 @@ class LowLevel:
 
     def prepare(self, params: Params, trees: TaskTree) -> TaskBook:
         """Prepares tasks (leading axis M) for acting."""
-        return TaskBook(tree=trees, instructions=jax.vmap(self.instruct, in_axes=(None, 0))(params, trees))
+        instructions = jax.vmap(self.instruct, in_axes=(None, 0))(params, trees)
+        return TaskBook(tree=trees, instructions=instructions, forks=jax.vmap(forks)(trees))
 
     def instructions_at(
         self,

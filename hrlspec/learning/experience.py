@@ -18,17 +18,15 @@ from jaxtyping import Bool, Int32, Key, Shaped, UInt32
 
 from envs_jax.arrays import Array
 from hrlspec.agent.agent import Agent
-from hrlspec.agent.experience import Bootstrap, Experience, HighDecision, LowDecision, Outcome, Step, View
+from hrlspec.agent.experience import Bootstrap, Experience, HighDecision, LowDecision, Outcome, Step, View, flat
 from hrlspec.agent.groups import in_groups
 from hrlspec.agent.high_level import Judgement
 from hrlspec.agent.low_level import Params, TaskBook
 from hrlspec.agent.networks.controller import Instruction
 from hrlspec.learning.relabel import Record, Relabelled, relabel, visits
+from hrlspec.learning.rollout import JUDGED_AT_ONCE
 from hrlspec.spec import RUNNING, TaskState, initial
 from hrlspec.tasks.rewards import RewardMachine
-
-JUDGED_AT_ONCE = 128
-"""Choices of copies that the high level evaluates at a time."""
 
 
 def gather(
@@ -146,11 +144,11 @@ def _estimates(
     the high level: its ratio is taken to 1.
     """
     row = (jnp.arange(slot.shape[0], dtype=jnp.int32)[:, None] * new.tree.parent.shape[1] + slot).reshape(-1)
-    fresh = agent.low.prepare(params, jax.tree.map(_flat, new.tree))
-    view, edge, node = jax.tree.map(_flat, (rollout.view, new.assigned, new.node))
+    fresh = agent.low.prepare(params, jax.tree.map(flat, new.tree))
+    view, edge, node = jax.tree.map(flat, (rollout.view, new.assigned, new.node))
     instructions = _instructions(agent, params, fresh, row, edge, node, new)
     _, value = jax.vmap(agent.low.control, in_axes=(None, 0, 0))(params, view, instructions)
-    judgement = _judged(agent, params, fresh, view, row, node, _flat(new.decided))
+    judgement = _judged(agent, params, fresh, view, row, node, flat(new.decided))
 
     def shaped(x: Shaped[Array, "R ..."]) -> Shaped[Array, "E T ..."]:
         return x.reshape((*slot.shape, *x.shape[1:]))
@@ -254,8 +252,3 @@ def _judged(
     if agent.high.ppo is None:
         return unknown
     return in_groups(judge, decided, (view, row, node), unknown, JUDGED_AT_ONCE)
-
-
-def _flat(x: Shaped[Array, "E T ..."]) -> Shaped[Array, "..."]:
-    """Merges the two leading axes."""
-    return x.reshape((x.shape[0] * x.shape[1], *x.shape[2:]))

@@ -10,10 +10,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float32, Shaped
+from jaxtyping import Bool, Float32
 
 from envs_jax.arrays import Array
-from hrlspec.agent.experience import Credit, LowBatch
+from hrlspec.agent.experience import Credit, LowBatch, flat
 from hrlspec.agent.low_level import LowLevel
 from hrlspec.config import PPOConfig
 from hrlspec.learning.optimiser import Metrics, annealed
@@ -130,8 +130,3 @@ def low_level_loss(
     log_prob = jax.vmap(low.actions.log_prob)(outputs, decision.action)
     entropy = jax.vmap(low.actions.entropy)(outputs)
     return loss(log_prob, decision.log_prob, value, entropy, credit, settings, progress)
-
-
-def flat(x: Shaped[Array, "V T ..."]) -> Shaped[Array, "..."]:
-    """Merges the two leading axes (zero-sized arrays too)."""
-    return x.reshape((x.shape[0] * x.shape[1], *x.shape[2:]))

@@ -13,10 +13,9 @@ from flax import struct
 from jaxtyping import Float32, Int32
 
 from envs_jax.arrays import Array
-from hrlspec.agent.experience import Step, View
+from hrlspec.agent.experience import Step, View, flat
 from hrlspec.agent.low_level import LowLevel
 from hrlspec.learning.optimiser import Metrics
-from hrlspec.learning.ppo import flat
 
 
 @struct.dataclass

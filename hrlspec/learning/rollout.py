@@ -19,13 +19,17 @@ from envs_jax import ContestedLayouts
 from envs_jax.arrays import Array
 from envs_jax.base import Layout
 from hrlspec.agent.agent import Agent
-from hrlspec.agent.experience import Bootstrap, HighDecision, LowDecision, Step, View
+from hrlspec.agent.experience import Bootstrap, HighDecision, LowDecision, Step, View, flat
 from hrlspec.agent.groups import in_groups, one_by_one
-from hrlspec.agent.interaction import Worker, act, decide, start, transition, where
+from hrlspec.agent.high_level import Judgement
+from hrlspec.agent.interaction import Worker, act, decide, start, task_of, transition, where
 from hrlspec.agent.low_level import Params, TaskBook
-from hrlspec.spec import TaskTree
+from hrlspec.spec import TaskState, TaskTree
 from hrlspec.tasks import curriculum
 from hrlspec.tasks.rewards import RewardMachine
+
+JUDGED_AT_ONCE = 128
+"""Decisions that the high level evaluates at a time when acting does not wait for them."""
 
 
 @struct.dataclass
@@ -134,7 +138,25 @@ def collect(
     value = _act(setting, collector.worker, silence, None).value
     value = jnp.where(steps.outcome.truncated[-1], steps.bootstrap.low[-1], value)
     bootstrap = dataclasses.replace(steps.bootstrap, low=steps.bootstrap.low.at[-1].set(value))
-    return collector, dataclasses.replace(steps, bootstrap=bootstrap)
+    high = _with_values(setting, steps) if agent.high.uses_values else steps.high
+    return collector, dataclasses.replace(steps, bootstrap=bootstrap, high=high)
+
+
+def _with_values(setting: Setting, steps: Step) -> HighDecision:
+    """The decisions with V^h also where there was nothing to choose, many at a time: acting did not wait for them."""
+    agent, book = setting.agent, setting.book
+    rows = jax.tree.map(flat, (steps.view, steps.task, steps.state, steps.low.value))
+    high, task, state = jax.tree.map(flat, steps.high), rows[1], rows[2]
+    settled = agent.high.settled(task_of(book, task), state, book.forks[task]) != TaskTree.NO_NODE
+
+    def judge(inputs: tuple[View, Int32[Array, " B"], TaskState, Float32[Array, " B"]]) -> Judgement:
+        view, task, state, worth = inputs
+        tree, instructions = jax.tree.map(lambda x: x[task], (book.tree, book.instructions))
+        return agent.high.judge_settled(agent.low, setting.params, view, tree, state, instructions, worth)
+
+    known = in_groups(judge, high.made & settled, rows, Judgement(high.value, high.advice), JUDGED_AT_ONCE)
+    value, advice = jax.tree.map(lambda x: x.reshape((*steps.task.shape, *x.shape[1:])), known)
+    return dataclasses.replace(steps.high, value=value, advice=advice)
 
 
 def _draw(key: Key[Array, ""], setting: Setting, correlation: Float32[Array, ""] | float) -> _Chance:
@@ -229,9 +251,11 @@ def _plan(
     """
     num_envs, due = truncated.shape[0], after.awaiting
     both = jax.tree.map(lambda *x: jnp.concatenate(x), after, ended)
-    needed = jnp.concatenate([due | last, truncated])
+    nowhere = jnp.zeros_like(due)
+    valued = jnp.concatenate([nowhere | last, truncated])
     noise = jnp.concatenate([noise, jnp.zeros_like(noise)])
-    planned = decide(setting.agent, setting.params, setting.book, both, needed, noise)
+    due_of_both = jnp.concatenate([due, nowhere])
+    planned = decide(setting.agent, setting.params, setting.book, both, due_of_both, noise, valued)
     bootstrap = jnp.where(truncated, planned.value[num_envs:], planned.value[:num_envs])
     planned = jax.tree.map(lambda x: x[:num_envs], planned)
     in_force = after.decision

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Key
+from jaxtyping import Bool, Int32, Key
 
 from envs_jax.arrays import Array
 from hrlspec.agent.distributions import MASKED
@@ -31,6 +31,11 @@ class NoChoice(Checked, HighLevel):
         """Nothing is learned."""
         del key, low, view, tree
         return {}
+
+    def settled(self, tree: TaskTree, state: TaskState, forks: Bool[Array, "B N"]) -> Int32[Array, " B"]:
+        """The root, which is no edge, wherever the task stands."""
+        del tree, forks
+        return jnp.full_like(state.node, TaskTree.ROOT)
 
     def choose(
         self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, instructions: Instruction

@@ -84,8 +84,7 @@ class ImplicitPlanner(Checked, HighLevel):
     ) -> Choice:
         """See :class:`HighLevel`."""
         advice, ahead = self.advise(low, params, view, tree, state, instructions)
-        plan = jax.vmap(self.planner(low).apply, in_axes=(None, 0, 0, 0, 0))
-        logits, value = cast("tuple[Array, Array]", plan(params["high"], view, tree, state, advice))
+        logits, value = self._plan(low, params["high"], view, tree, state, advice)
         return Choice(logits, value, advice, ahead)
 
     def judge(
@@ -106,6 +105,21 @@ class ImplicitPlanner(Checked, HighLevel):
         return Judgement(
             jnp.zeros(state.node.shape, jnp.float32), self.advise(low, params, view, tree, state, instructions)[0]
         )
+
+    def judge_settled(
+        self,
+        low: LowLevel,
+        params: Params,
+        view: View,
+        tree: TaskTree,
+        state: TaskState,
+        instructions: Instruction,
+        worth: Float32[Array, " B"],
+    ) -> Judgement:
+        """See :class:`HighLevel`; where one way is open, its value is all that `advise` would find."""
+        del instructions
+        advice = jnp.broadcast_to((self.network.advice > 0) * worth[:, None], tree.parent.shape)
+        return Judgement(self._plan(low, params["high"], view, tree, state, advice)[1], advice)
 
     def advise(
         self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, instructions: Instruction
@@ -133,7 +147,7 @@ class ImplicitPlanner(Checked, HighLevel):
 
         env = jnp.repeat(jnp.arange(known.shape[0], dtype=jnp.int32), num_paths)
         flat_paths = jax.tree.map(lambda x: x.reshape((known.size, *x.shape[2:])), paths)
-        group = 2 * low.config.group
+        group = known.shape[0]
         values = in_groups(value, known.reshape(-1), (env, flat_paths), jnp.zeros(env.shape, jnp.float32), group)
         advice, ahead = jax.vmap(_best_paths)(edge, known, values.reshape(known.shape), paths.ahead, instructions.ahead)
         return jax.lax.stop_gradient(advice), ahead
@@ -142,14 +156,8 @@ class ImplicitPlanner(Checked, HighLevel):
         self, low: LowLevel, params: Any, batch: HighBatch, progress: Float32[Array, ""]
     ) -> tuple[Float32[Array, ""], Metrics]:
         """PPO and TransE loss on a minibatch ``[B]`` (eqs. 4 and 5)."""
-        planner = self.planner(low)
         decision = batch.decision
-        logits, value = cast(
-            "tuple[Array, Array]",
-            jax.vmap(planner.apply, in_axes=(None, 0, 0, 0, 0))(
-                params, batch.view, batch.tree, batch.state, decision.advice
-            ),
-        )
+        logits, value = self._plan(low, params, batch.view, batch.tree, batch.state, decision.advice)
         choices = Categorical(logits.shape[-1])
         # Where only one edge is open there is nothing to learn, and the mean of the advantages is another one.
         free = batch.credit.learns & ((logits > MASKED / 2).sum(-1) > 1)
@@ -163,7 +171,7 @@ class ImplicitPlanner(Checked, HighLevel):
             progress,
         )
         if self.transe:
-            metrics["transe_loss"] = self.transe_loss(planner, params, batch)
+            metrics["transe_loss"] = self.transe_loss(self.planner(low), params, batch)
             loss = loss + self.transe * metrics["transe_loss"]
         return loss, metrics
 
@@ -181,6 +189,13 @@ class ImplicitPlanner(Checked, HighLevel):
         margin = jnp.maximum(0.0, self.transe_margin - other)
         both = valid & jnp.roll(valid, 1)
         return ppo.masked_mean(error, valid & batch.completed) + ppo.masked_mean(margin, both)
+
+    def _plan(
+        self, low: LowLevel, params: Any, view: View, tree: TaskTree, state: TaskState, advice: Float32[Array, "B N"]
+    ) -> tuple[Float32[Array, "B N"], Float32[Array, " B"]]:
+        """The planner's logits and values, with its own parameters."""
+        plan = jax.vmap(self.planner(low).apply, in_axes=(None, 0, 0, 0, 0))
+        return cast("tuple[Array, Array]", plan(params, view, tree, state, advice))
 
     def _paths(
         self, low: LowLevel, tree: TaskTree, state: TaskState, instructions: Instruction

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from hrlspec.agent.networks.tree import lookahead, lookback, routes
+from hrlspec.agent.networks.tree import forks, lookahead, lookback, routes
 from hrlspec.methods import Ours
-from hrlspec.spec import TaskTree, advance, initial, open_edges
+from hrlspec.spec import TaskState, TaskTree, advance, initial, open_edges
 from tests.probes import Corridor, on_device, quick_jit, random_params, small_agent, small_config, small_planner
 from tests.trees import random_tree
 
@@ -38,6 +40,54 @@ def test_routes_are_the_ways_down() -> None:
         for below in range(10):
             way = way_to(tree, node, below)[:LENGTH] if tree.valid[below] else []
             assert found[below].tolist() == way + [TaskTree.NO_NODE] * (LENGTH - len(way))
+
+
+def test_forks_are_where_more_than_one_way_leads_on() -> None:
+    rng = np.random.default_rng(4)
+    found = {False: 0, True: 0}
+    for _ in range(40):
+        tree = random_tree(rng, num_nodes=8, num_propositions=4)
+        nodes = np.flatnonzero(tree.valid)
+        children = np.bincount(tree.parent[nodes[1:]], minlength=8)
+        for node, fork in zip(nodes, np.asarray(forks(on_device(tree)))[nodes], strict=True):
+            assert fork == any(children[below] > 1 for below in nodes if below == node or way_to(tree, node, below))
+            found[bool(fork)] += 1
+    assert min(found.values()) > 20
+
+
+@pytest.mark.parametrize("advice", [0.0, 10.0])
+def test_where_nothing_is_to_choose_the_planner_would_choose_the_same(advice: float) -> None:
+    """And hand down the same way, whatever it has learned."""
+    network = dataclasses.replace(small_config().network, roles=True, lookahead=LENGTH)
+    agent = small_agent(ENV, small_config(network=network), Ours(high=small_planner(network__advice=advice)))
+    params, view = random_params(agent, 5), ENV.view_at(2)
+
+    @quick_jit
+    def both(tree: TaskTree, state: TaskState) -> Any:
+        book = agent.low.prepare(params, jax.tree.map(lambda x: x[None], tree))
+        batch = jax.tree.map(lambda x: x[None], (view, tree, state))
+        choice = agent.high.choose(agent.low, params, *batch, book.instructions)
+        return agent.high.settled(*batch[1:], book.forks)[0], jax.tree.map(lambda x: x[0], choice), book.instructions
+
+    rng = np.random.default_rng(6)
+    settled = 0
+    for _ in range(60):
+        tree = on_device(random_tree(rng, num_nodes=6, num_propositions=ENV.num_propositions, distinct=True))
+        state = initial(tree)
+        for _ in range(int(rng.integers(3))):
+            labels = jnp.asarray(rng.random(ENV.num_propositions) < 0.4)
+            state = advance(tree, state, labels, TaskTree.NO_NODE)
+        edge, choice, instructions = jax.tree.map(np.asarray, both(tree, state))
+        ways = [way_to(tree, int(state.node), leaf) for leaf in np.flatnonzero(tree.accepting)]
+        open_ways = [way for way in ways if way and open_edges(tree, state)[way[0]]]
+        edges = {way[0] for way in open_ways}
+        assert (edge != TaskTree.NO_NODE) == (len(open_ways if advice else edges) == 1)
+        if edge != TaskTree.NO_NODE:
+            assert edges == {int(edge)}
+            assert choice.logits.argmax() == edge
+            np.testing.assert_array_equal(choice.ahead[edge], instructions.ahead[0, edge])
+            settled += 1
+    assert 10 < settled < 50
 
 
 def test_lookahead_collects_what_each_depth_reaches() -> None:

@@ -52,6 +52,17 @@ def lookahead(tree: TaskTree, depth: int) -> Bool[Array, "N D P"]:
     return jnp.stack(ahead, 1) if ahead else jnp.zeros((tree.num_nodes, 0, tree.num_propositions), bool)
 
 
+def forks(tree: TaskTree) -> Bool[Array, " N"]:
+    """Whether more than one way leads on from a node or from one below it, bool ``[N]``."""
+    several = jnp.zeros(tree.num_nodes, jnp.int32).at[tree.parent].add(tree.edges.astype(jnp.int32)) > 1
+
+    def visit(fork: Bool[Array, " N"], node: Int32[Array, ""]) -> tuple[Bool[Array, " N"], None]:
+        return fork.at[tree.parent[node]].max(fork[node] & tree.edges[node]), None
+
+    # Children come after their parents, so the last node is visited first.
+    return jax.lax.scan(visit, several, jnp.arange(tree.num_nodes, dtype=jnp.int32), reverse=True)[0]
+
+
 def lookback(tree: TaskTree, depth: int) -> Bool[Array, "N D P"]:
     """What was reached 1, 2, ... sub-tasks before each edge, bool ``[N, depth, P]``; nothing before the first."""
     behind = []
