@@ -5,6 +5,7 @@ Axes: **E** environments, **L** parts.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -16,6 +17,19 @@ from envs_jax.arrays import Array
 
 Inputs = TypeVar("Inputs")
 Outputs = TypeVar("Outputs")
+
+
+def take(tree: Inputs, *index: Any) -> Inputs:
+    """What a pytree holds at some places of its leading axes, none of which is negative or beyond the end.
+
+    Told so, JAX makes a sixth of the operations that it makes of ``x[index]``, and a program compiles the sooner.
+
+    Args:
+        tree: leaves ``[A, B, ...]``.
+        index: int32 arrays or slices, for the axes A, B, ...
+    """
+    taken: Inputs = jax.tree.map(lambda x: x.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False), tree)
+    return taken
 
 
 def in_groups(
@@ -39,7 +53,7 @@ def in_groups(
     def body(carry: tuple[Bool[Array, " E"], Outputs]) -> tuple[Bool[Array, " E"], Outputs]:
         waiting, outputs = carry
         index = jnp.nonzero(waiting, size=group, fill_value=num_envs)[0]
-        results = function(jax.tree.map(lambda x: x[jnp.minimum(index, num_envs - 1)], inputs))
+        results = function(take(inputs, jnp.minimum(index, num_envs - 1)))
         outputs = jax.tree.map(lambda out, new: out.at[index].set(new, mode="drop"), outputs, results)
         return waiting.at[index].set(False, mode="drop"), outputs
 
@@ -56,9 +70,11 @@ def one_by_one(function: Callable[[Any], Any], parts: Any) -> Any:
 
     def step(i: Int32[Array, ""], results: Any) -> Any:
         # With the counter in the barrier, what is made of a single part does not leave the loop either.
-        i, part = jax.lax.optimization_barrier((i, jax.tree.map(lambda x: x[i], parts)))
-        return jax.tree.map(lambda all_, one: all_.at[i].set(one), results, function(part))
+        i, part = jax.lax.optimization_barrier((i, jax.tree.map(functools.partial(pick, index=i), parts)))
+        return jax.tree.map(functools.partial(put, index=i), results, function(part))
 
+    pick = functools.partial(jax.lax.dynamic_index_in_dim, axis=0, keepdims=False, allow_negative_indices=False)
+    put = functools.partial(jax.lax.dynamic_update_index_in_dim, axis=0, allow_negative_indices=False)
     num_parts = jax.tree.leaves(parts)[0].shape[0]
     shapes = jax.eval_shape(function, jax.tree.map(lambda x: x[0], parts))
     empty = jax.tree.map(lambda x: jnp.zeros((num_parts, *x.shape), x.dtype), shapes)

@@ -20,7 +20,7 @@ from envs_jax.base import Layout, State
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.distributions import Categorical
 from hrlspec.agent.experience import HighDecision, LowDecision, Outcome, View, undecided, view_of
-from hrlspec.agent.groups import in_groups
+from hrlspec.agent.groups import in_groups, take
 from hrlspec.agent.low_level import Params, TaskBook
 from hrlspec.agent.networks.controller import Instruction
 from hrlspec.agent.shield import shielded_action
@@ -54,8 +54,7 @@ class Worker:
 
 def task_of(book: TaskBook, rows: Int[Array, " E"]) -> TaskTree:
     """The trees of the given rows of a book."""
-    tree: TaskTree = jax.tree.map(lambda x: x[rows], book.tree)
-    return tree
+    return take(book.tree, rows)
 
 
 def start(
@@ -105,7 +104,7 @@ def decide(
 
     def choose(inputs: tuple[View, Int[Array, " B"], TaskState, Float32[Array, "B N"]]) -> HighDecision:
         view, task, state, noise = inputs
-        tree, instructions = jax.tree.map(lambda x: x[task], (book.tree, book.instructions))
+        tree, instructions = take((book.tree, book.instructions), task)
         choice = agent.high.choose(agent.low, params, view, tree, state, instructions)
         edge, log_prob = jax.vmap(Categorical(noise.shape[-1]).sample)(choice.logits, noise)
         ahead = choice.ahead[jnp.arange(edge.shape[0], dtype=jnp.int32), edge]

@@ -19,6 +19,7 @@ from envs_jax import Environment, Symmetric
 from envs_jax.arrays import Array
 from hrlspec.agent.distributions import Distribution, distribution_over
 from hrlspec.agent.experience import View
+from hrlspec.agent.groups import take
 from hrlspec.agent.networks.controller import Controller, Instruction, Sees
 from hrlspec.agent.networks.reach_critic import ReachCritic
 from hrlspec.agent.networks.tree import forks
@@ -110,7 +111,7 @@ class LowLevel:
             ahead: float32 ``[..., D, P]``, the reach sets of the sub-tasks planned after them.
         """
         if self.sees != "whole task":
-            return dataclasses.replace(jax.tree.map(lambda x: x[(*where, edge)], instructions), ahead=ahead)
+            return dataclasses.replace(take(instructions, *where, edge), ahead=ahead)
         future = self.controller.apply(params["low"], instructions.future[where], feasible, method="remaining")
         nothing = jnp.zeros((*edge.shape, instructions.reach.shape[-1]), jnp.float32)
         behind = jnp.zeros((*edge.shape, 0, instructions.reach.shape[-1]), jnp.float32)

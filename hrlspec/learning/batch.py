@@ -14,6 +14,7 @@ from jaxtyping import Bool, Int32, Key, Shaped
 from envs_jax.arrays import Array
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.experience import Credit, Experience, HighBatch, LowBatch
+from hrlspec.agent.groups import take
 from hrlspec.config import PPOConfig
 from hrlspec.learning import ppo
 from hrlspec.learning.targets import high_level_targets, low_level_targets
@@ -72,10 +73,10 @@ def high_batch(key: Key[Array, ""], agent: Agent, x: Experience, settings: PPOCo
     over = (outcome.terminated | outcome.truncated)[row, end]
 
     def at(field: Any, when: Int32[Array, " B"] = time) -> Any:
-        return jax.tree.map(lambda leaf: leaf[row, when], field)
+        return take(field, row, when)
 
     return HighBatch(
-        tree=jax.tree.map(lambda leaf: leaf[row, x.slot[row, time]], x.trees),
+        tree=take(x.trees, row, x.slot[row, time]),
         view=at(x.view),
         state=at(x.state),
         decision=at(x.high),
@@ -105,7 +106,7 @@ def _feasible(agent: Agent, x: Experience) -> Bool[Array, "V T _"]:
     if agent.method.sees != "whole task":
         return jnp.zeros((*x.slot.shape, 0), bool)
     rows = jnp.arange(x.slot.shape[0], dtype=jnp.int32)[:, None]
-    trees = jax.tree.map(lambda leaf: leaf[rows, x.slot], x.trees)
+    trees = take(x.trees, rows, x.slot)
     return jax.vmap(jax.vmap(open_edges))(trees, x.state)
 
 

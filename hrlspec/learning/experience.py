@@ -19,7 +19,7 @@ from jaxtyping import Bool, Int32, Key, Shaped, UInt32
 from envs_jax.arrays import Array
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.experience import Bootstrap, Experience, HighDecision, LowDecision, Outcome, Step, View, flat
-from hrlspec.agent.groups import in_groups
+from hrlspec.agent.groups import in_groups, take
 from hrlspec.agent.high_level import Judgement
 from hrlspec.agent.low_level import Params, TaskBook
 from hrlspec.agent.networks.controller import Instruction
@@ -59,7 +59,7 @@ def gather(
         within = (offset + jnp.arange(config.copies_per_block, dtype=jnp.int32)) % config.envs_per_block
         chosen = (jnp.arange(0, len(envs), config.envs_per_block, dtype=jnp.int32)[:, None] + within).reshape(-1)
         keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, envs[chosen])
-        some = jax.tree.map(lambda x: x[chosen], by_env)
+        some = take(by_env, chosen)
         parts.append(copies(keys, agent, params, machine, book, some, reserved))
 
     num_blocks = len(envs) // config.envs_per_block
@@ -78,7 +78,7 @@ def originals(book: TaskBook, rollout: Step, num_slots: int) -> Experience:
     tasks = tasks.at[envs, rollout.episode].set(rollout.task, mode="drop")
     valid = rollout.episode < num_slots
     return Experience(
-        trees=jax.tree.map(lambda x: x[tasks], book.tree),
+        trees=take(book.tree, tasks),
         slot=jnp.minimum(rollout.episode, num_slots - 1),
         view=rollout.view,
         state=rollout.state,
@@ -242,7 +242,7 @@ def _judged(
 
     def judge(inputs: tuple[View, Array, Array]) -> Judgement:
         view, row, node = inputs
-        tree, instructions = jax.tree.map(lambda x: x[row], (fresh.tree, fresh.instructions))
+        tree, instructions = take((fresh.tree, fresh.instructions), row)
         state = dataclasses.replace(jax.vmap(initial)(tree), node=node)
         return agent.high.judge(agent.low, params, view, tree, state, instructions)
 

@@ -15,6 +15,7 @@ import optax
 from jaxtyping import Float32, Int32, Key
 
 from envs_jax.arrays import Array
+from hrlspec.agent.groups import take
 from hrlspec.config import OptimiserConfig
 
 Metrics = dict[str, Float32[Array, "..."]]
@@ -87,7 +88,7 @@ def fit(
     shuffled = jnp.argsort(jax.random.bits(key, (config.epochs, size), jnp.uint32), axis=-1).astype(jnp.int32)
 
     def step(carry: tuple[Any, Any], rows: Int32[Array, " rows"]) -> tuple[tuple[Any, Any], Metrics]:
-        sample = jax.tree.map(lambda x: x[:, rows], batch)
+        sample = take(batch, slice(None), rows)
 
         def value_and_grad(params: Any) -> Any:
             return mean_over_blocks(functools.partial(jax.value_and_grad(loss, has_aux=True), params), sample)

@@ -20,7 +20,7 @@ from envs_jax.arrays import Array
 from envs_jax.base import Layout
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.experience import Bootstrap, HighDecision, LowDecision, Step, View, flat
-from hrlspec.agent.groups import in_groups, one_by_one
+from hrlspec.agent.groups import in_groups, one_by_one, take
 from hrlspec.agent.high_level import Judgement
 from hrlspec.agent.interaction import Worker, act, decide, start, task_of, transition, where
 from hrlspec.agent.low_level import Params, TaskBook
@@ -92,7 +92,7 @@ def fill_pool(
     def draw(key: Key[Array, ""], task: Int32[Array, ""], wanted: Bool[Array, ""]) -> Layout:
         if not config.contested or not isinstance(env, ContestedLayouts):
             return env.sample_layout(key, env.default_params)
-        first, second = opening(jax.tree.map(lambda x: x[task], book.tree))
+        first, second = opening(take(book.tree, task))
         return env.contested_layout(key, first & wanted, second & wanted, env.default_params)
 
     def one(index: Int32[Array, ""]) -> Pool:
@@ -151,7 +151,7 @@ def _with_values(setting: Setting, steps: Step) -> HighDecision:
 
     def judge(inputs: tuple[View, Int32[Array, " B"], TaskState, Float32[Array, " B"]]) -> Judgement:
         view, task, state, worth = inputs
-        tree, instructions = jax.tree.map(lambda x: x[task], (book.tree, book.instructions))
+        tree, instructions = take((book.tree, book.instructions), task)
         return agent.high.judge_settled(agent.low, setting.params, view, tree, state, instructions, worth)
 
     known = in_groups(judge, high.made & settled, rows, Judgement(high.value, high.advice), JUDGED_AT_ONCE)
@@ -192,7 +192,7 @@ def _step(
     worker, outcome = transition(step_keys, agent.env, setting.machine, book, before, low.action)
     ended = outcome.terminated | outcome.truncated
     started = collector.started + ended
-    fresh = jax.tree.map(lambda x: x[jnp.arange(num_envs, dtype=jnp.int32), started % pool.task.shape[1]], pool)
+    fresh = take(pool, jnp.arange(num_envs, dtype=jnp.int32), started % pool.task.shape[1])
     begun = start(reset_keys, agent.env, setting.machine, book, fresh.layout, fresh.task)
     after = where(ended, begun, worker)
     reached = _reach_values(setting, worker.view)

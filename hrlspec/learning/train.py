@@ -18,6 +18,7 @@ from jaxtyping import Float32, Int32, Key, UInt32
 from envs_jax.arrays import Array
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.experience import Experience, Step
+from hrlspec.agent.groups import take
 from hrlspec.agent.interaction import start
 from hrlspec.agent.low_level import Params, TaskBook
 from hrlspec.learning.batch import high_batch, low_batch
@@ -152,7 +153,7 @@ class Trainer:
             params=params,
             optimisers=optimisers,
             collector=dataclasses.replace(collector, worker=dataclasses.replace(collector.worker, task=envs)),
-            tasks=jax.tree.map(lambda x: x[collector.worker.task], book.tree),
+            tasks=take(book.tree, collector.worker.task),
             curriculum=self._promoted(state.curriculum, steps),
             key=state.key,
             iteration=state.iteration + 1,

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float32, Int32, Key
 from envs_jax.arrays import Array
 from hrlspec.agent.distributions import MASKED, Categorical
 from hrlspec.agent.experience import HighBatch, View
-from hrlspec.agent.groups import in_groups
+from hrlspec.agent.groups import in_groups, take
 from hrlspec.agent.high_level import Choice, HighLevel, Judgement
 from hrlspec.agent.low_level import LowLevel, Params
 from hrlspec.agent.method import Method
@@ -142,7 +142,7 @@ class ImplicitPlanner(Checked, HighLevel):
 
         def value(inputs: tuple[Int32[Array, " G"], Instruction]) -> Float32[Array, " G"]:
             env, path = inputs
-            seen = jax.tree.map(lambda x: x[env], view)
+            seen = take(view, env)
             return jax.vmap(low.control, in_axes=(None, 0, 0))(params, seen, path)[1]
 
         env = jnp.repeat(jnp.arange(known.shape[0], dtype=jnp.int32), num_paths)
@@ -208,7 +208,7 @@ class ImplicitPlanner(Checked, HighLevel):
         path = path[jnp.minimum(leaf, num_nodes - 1)]
         edge, later = path[:, 0], path[:, 1:]
         ahead = tree.reach[later] & (later >= 0)[..., None] & (low.sees == "future")
-        some = dataclasses.replace(jax.tree.map(lambda x: x[edge], instructions), ahead=ahead.astype(jnp.float32))
+        some = dataclasses.replace(take(instructions, edge), ahead=ahead.astype(jnp.float32))
         return edge, leaf < num_nodes, some
 
 
