@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import optax
 from jaxtyping import Float32, Int32, Key
@@ -46,9 +47,12 @@ def gradient_step(
     (value, metrics), gradient = value_and_grad(params)
     norm = optax.tree.norm(gradient)
     finite = jnp.isfinite(norm) & jnp.isfinite(value)
-    updates, new_state = transform.update(gradient, state, params)
-    stepped = jax.tree.map(lambda p, u: p - learning_rate * u, params, updates)
-    params, state = jax.tree.map(lambda new, old: jnp.where(finite, new, old), (stepped, new_state), (params, state))
+
+    def stepped(params: Any, state: optax.OptState) -> tuple[Any, optax.OptState]:
+        updates, new_state = transform.update(gradient, state, params)
+        return jax.tree.map(lambda p, u: p - learning_rate * u, params, updates), new_state
+
+    params, state = jax.lax.cond(finite, stepped, lambda *as_it_was: as_it_was, params, state)
     return params, state, {**metrics, "grad_norm": norm, "skipped": (~finite).astype(jnp.float32)}
 
 
@@ -87,15 +91,20 @@ def fit(
     rate = annealed(config.learning_rate, config.final_learning_rate, progress)
     shuffled = jnp.argsort(jax.random.bits(key, (config.epochs, size), jnp.uint32), axis=-1).astype(jnp.int32)
 
+    # As one vector, the steps of the optimiser are a few operations on it instead of as many for each layer.
+    flat, restore = jax.flatten_util.ravel_pytree(params)
+
     def step(carry: tuple[Any, Any], rows: Int32[Array, " rows"]) -> tuple[tuple[Any, Any], Metrics]:
         sample = take(batch, slice(None), rows)
 
-        def value_and_grad(params: Any) -> Any:
-            return mean_over_blocks(functools.partial(jax.value_and_grad(loss, has_aux=True), params), sample)
+        def value_and_grad(flat: Float32[Array, " _"]) -> Any:
+            both = functools.partial(jax.value_and_grad(loss, has_aux=True), restore(flat))
+            value, gradient = mean_over_blocks(both, sample)
+            return value, jax.flatten_util.ravel_pytree(gradient)[0]
 
-        params, state, metrics = gradient_step(value_and_grad, *carry, transform, rate)
-        return (params, state), metrics
+        flat, state, metrics = gradient_step(value_and_grad, *carry, transform, rate)
+        return (flat, state), metrics
 
     rows = shuffled.reshape(config.epochs * config.minibatches, -1)
-    (params, state), metrics = jax.lax.scan(step, (params, state), rows)
-    return params, state, jax.tree.map(jnp.mean, metrics)
+    (flat, state), metrics = jax.lax.scan(step, (flat, state), rows)
+    return restore(flat), state, jax.tree.map(jnp.mean, metrics)

@@ -67,10 +67,29 @@ def dotted(settings: Any, prefix: str = "") -> dict[str, Any]:
 
 ADDED = {"config.blocks": 1}
 """What records lack that are older than these settings, and what they would have said."""
+BEFORE = {
+    "config.blocks": (1,),
+    "config.group": (8, 32),
+    "config.low.optimiser.epochs": (2,),
+    "config.low.optimiser.minibatches": (16, 32),
+}
+"""What has been changed for speed since the records were made, and what they say of it. The page of results tells."""
 
 
 def effective(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings as a run folder keeps them, old or new, by today's names; without those of a shield that is off."""
+    """Settings as a run folder keeps them, old or new, by today's names; without those of a shield that is off.
+
+    And without those that were changed since: see `before`.
+    """
+    return {name: value for name, value in _translated(settings).items() if name not in BEFORE}
+
+
+def before(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """What a record says of the settings that were changed since."""
+    return {name: value for name, value in _translated(settings).items() if name in BEFORE}
+
+
+def _translated(settings: Mapping[str, Any]) -> dict[str, Any]:
     now = dotted(json.loads(json.dumps(settings)))
     if "method_settings" not in settings:
         now = _renamed(now)

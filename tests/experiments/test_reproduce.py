@@ -44,7 +44,7 @@ from hrlspec.presets import Recipe, preset
 from hrlspec.run.errors import Interrupted, UserError
 from hrlspec.run.experiment import Experiment
 from hrlspec.run.run_flags import experiments_of, parse_run
-from tests.experiments.earlier_settings import effective
+from tests.experiments.earlier_settings import BEFORE, before, effective
 from tests.experiments.made import record
 from tests.run.tiny import TOTAL, arguments
 
@@ -117,11 +117,14 @@ def test_presets_have_the_rates_that_tuning_chose(panel: Panel) -> None:
 
 
 def test_kept_records_are_of_what_their_flags_mean_today() -> None:
-    """Whoever changes a preset makes the runs with it again, and deletes their records for that."""
+    """Whoever changes a preset makes the runs with it anew and deletes the records for that, or says what changed."""
     kept = read_records([run for panel in (PANELS | TUNING).values() for run in panel.runs(5, None)], KEPT)
     assert kept
     for run, found in kept.items():
-        assert effective(found.settings) == effective(dataclasses.asdict(experiment_now(run))), run.name
+        now = dataclasses.asdict(experiment_now(run))
+        assert effective(found.settings) == effective(now), run.name
+        for name, value in before(found.settings).items():
+            assert value in (*BEFORE[name], before(now)[name]), f"{run.name}: {name}"
 
 
 def test_the_tasks_of_the_trajectories_are_tasks() -> None:

@@ -75,7 +75,7 @@ BAD_FLAGS = [
     ("--config.low.optimiser.minibatches 0", "--config.low.optimiser.minibatches is 0, expected at least 1"),
     (
         "--config.low.optimiser.minibatches 7",
-        "--config.low.optimiser.minibatches is 7, expected a divisor of 160",
+        "--config.low.optimiser.minibatches is 7, expected a divisor of 80",
     ),
     ("--method.high.ppo.optimiser.minibatches 1000", "--method.high.ppo.optimiser.minibatches is 1000, expected a div"),
     ("--method.high.ppo.optimiser.learning-rate -1", "--method.high.ppo.optimiser.learning-rate is -1"),
