@@ -125,9 +125,9 @@ def learner(name: str, recipe: Recipe, devices: int) -> tuple[Trainer, Any, Any]
 
 def programs(name: str, recipe: Recipe, trainer: Trainer) -> tuple[Program, Program]:
     """The training state and an iteration, compiled as runs do."""
-    quick = preset(name).compiles_quickly(recipe)
-    init = Program("init", Trainer.init, trainer, quick=quick, devices=trainer.devices)
-    return init, Program("iterate", Trainer.iterate, trainer, quick=quick, devices=trainer.devices)
+    effort = preset(name).effort(recipe)
+    init = Program("init", Trainer.init, trainer, effort=effort, devices=trainer.devices)
+    return init, Program("iterate", Trainer.iterate, trainer, effort=effort, devices=trainer.devices)
 
 
 def training(name: str, recipe: Recipe, seconds: float, devices: int) -> dict[str, Any]:

@@ -52,7 +52,7 @@ def parts(name: str, recipe: Recipe, iterations: int, seconds: float) -> dict[st
     """Milliseconds of an iteration by part, medians; of one step of collection, where the name says so."""
     trainer, bank, machine = learner(name, recipe, devices=1)
     agent, config, ppo = trainer.agent, trainer.agent.config, trainer.agent.high.ppo
-    options = compiler_options(quick=preset(name).compiles_quickly(recipe))
+    options = compiler_options(preset(name).effort(recipe))
     reserved, key = jnp.zeros(1, jnp.uint32), jax.random.key(1)
     envs = jnp.arange(config.num_envs, dtype=jnp.int32)
     init, iterate = programs(name, recipe, trainer)

@@ -15,6 +15,8 @@ from types import UnionType
 from typing import Any, Literal, TypeVar
 
 S = TypeVar("S")
+Effort = Literal["least", "little", "most"]
+"""How much time the compiler may take; see `hrlspec.run.platform.compiler_options`."""
 _WORDS = {int: "a whole number", float: "a number", bool: "True or False", str: "text", type(None): "None"}
 
 

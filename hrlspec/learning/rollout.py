@@ -217,8 +217,8 @@ def _step(
         since=jnp.where(after.awaiting, 0, collector.since + 1),
     )
     if reached is not None:  # of the state that the next action is taken in: another one where an episode began
-        few = agent.config.group
-        reached = in_groups(lambda view: _reach_values(setting, view), ended, after.view, reached, few)
+        values = functools.partial(jax.vmap(agent.low.reach_values, (None, 0)), setting.params)
+        reached = in_groups(values, ended, after.view, reached, agent.config.group)
     return (collector, reached), record
 
 

@@ -45,7 +45,7 @@ def _small(settings: Settings) -> Settings:
     )
 
 
-ROOMS = Preset("rooms", Rooms, _rooms, learning_rates=LETTER.learning_rates, quick_compile=True)
+ROOMS = Preset("rooms", Rooms, _rooms, learning_rates=LETTER.learning_rates, compiled_with="least")
 DILEMMA = Preset(
     "dilemma",
     # The way to b leads past a, and reaching a ends the task before c, which pays most, can be reached.
@@ -61,5 +61,5 @@ DILEMMA = Preset(
     _dilemma,
     walk_with_bonuses,
     learning_rates=WALK.learning_rates,
-    quick_compile=True,
+    compiled_with="least",
 )

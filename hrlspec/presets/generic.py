@@ -40,10 +40,11 @@ def preset_for(env: Environment) -> Preset:
     """
 
     def fit(settings: Settings, recipe: Recipe) -> Settings:
-        del recipe
         box = isinstance(env.action_space, Box)
         if box:
-            settings = continuous(settings, learning_rate=1e-3).evolve(_FAR_GOALS)
+            # As large as they are with fewer relabelled copies.
+            more = {"config.low.optimiser.minibatches": 48} if recipe == "hrlspec" else {}
+            settings = continuous(settings, learning_rate=1e-3).evolve(_FAR_GOALS | more)
         config = settings.config
         view = jax.eval_shape(env.proposition_view, jax.ShapeDtypeStruct(env.observation_shape, "float32"))
         numbers, side = sum(part.size for part in view), min(view[0].shape[1:], default=1)
@@ -57,7 +58,7 @@ def preset_for(env: Environment) -> Preset:
             }
         )
 
-    return Preset(env.name, lambda: env, fit, quick_compile=True)
+    return Preset(env.name, lambda: env, fit, compiled_with="least")
 
 
 def unseen_tasks(env: Environment, seed: int) -> str:

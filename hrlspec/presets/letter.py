@@ -77,7 +77,7 @@ LETTER = Preset(
     bonuses=_BONUSES,
     learning_rates=_LEARNING_RATES,
     suites=_SUITES,
-    quick_compile=True,
+    compiled_with="least",
 )
 LETTER12 = Preset(
     "letter12",
@@ -85,5 +85,5 @@ LETTER12 = Preset(
     _twelve,
     bonuses=_BONUSES,
     suites=_SUITES12,
-    quick_compile=True,
+    compiled_with="least",
 )

@@ -10,7 +10,7 @@ import numpy as np
 
 from envs_jax import Environment
 from hrlspec.agent.method import Method
-from hrlspec.config import Config, evolve
+from hrlspec.config import Config, Effort, evolve
 from hrlspec.evaluation import Suite, suite_from_text
 from hrlspec.methods import METHODS, ImplicitPlanner
 from hrlspec.presets.recipes import Recipe, RewardSet, Settings, recipe, with_bonuses
@@ -41,8 +41,8 @@ class Preset:
             its like).
         suites: test suites by name, and how those in the files of this package were drawn.
         texts: the test suites by name, one formula a line, where they are not in those files.
-        quick_compile: whether programs run as fast when XLA spends little time on them; true where matrix products
-            are most of the arithmetic, which are not compiled.
+        compiled_with: the effort that compiling programs is worth. Where matrix products, which are not compiled, are
+            most of the time, the least.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Preset:
     learning_rates: Mapping[tuple[Recipe, str], float] = dataclasses.field(default_factory=dict)
     suites: Mapping[str, SuiteRule] = dataclasses.field(default_factory=dict)
     texts: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    quick_compile: bool = False
+    compiled_with: Effort = "most"
 
     def settings(
         self, method: str | Method = "ours", recipe_name: Recipe = "hrlspec", reward_set: RewardSet = 1
@@ -80,9 +80,9 @@ class Preset:
         rate = self.learning_rates.get((recipe_name, tuned), config.low.optimiser.learning_rate)
         return evolve(config, {"low.optimiser.learning_rate": rate}), chosen
 
-    def compiles_quickly(self, recipe_name: Recipe) -> bool:
-        """Whether a recipe's programs do; what surrounds the matrix products of recipe ``paper`` would be slower."""
-        return self.quick_compile and recipe_name == "hrlspec"
+    def effort(self, recipe_name: Recipe) -> Effort:
+        """How much a recipe's programs are compiled with; recipe ``paper`` has more around its matrix products."""
+        return self.compiled_with if recipe_name == "hrlspec" else "most"
 
     def rewards(self, reward_set: RewardSet = 1) -> RewardMachine:
         """The rewards of a reward set: 1 for completion; in set 2 also for sub-tasks and for orders of letters."""

@@ -62,6 +62,8 @@ WALK = Preset(
     bonuses=(Bonus("d", "b", 5.0, ("e",)), Bonus("b", "c", 10.0, ("a",))),
     learning_rates={("paper", "ltl2action"): 2e-3, ("paper", "option"): 2e-3, ("hrlspec", "option"): 2e-3},
     suites=_SUITES,
-    quick_compile=True,
+    compiled_with="little",
 )
-FLATWORLD = Preset("flatworld", functools.partial(envs_jax.make, "flatworld"), walk, suites=_SUITES, quick_compile=True)
+FLATWORLD = Preset(
+    "flatworld", functools.partial(envs_jax.make, "flatworld"), walk, suites=_SUITES, compiled_with="little"
+)

@@ -135,8 +135,8 @@ class Learner:
 
     def _program(self, name: str, function: Any) -> Program:
         """A function of the trainer; kept from run to run unless it is made of code that others may change."""
-        quick, kept = self.preset.compiles_quickly(self.experiment.recipe), not self.experiment.is_foreign
-        return Program(name, function, self.trainer, quick=quick, kept=kept, devices=self.trainer.devices)
+        effort, kept = self.preset.effort(self.experiment.recipe), not self.experiment.is_foreign
+        return Program(name, function, self.trainer, effort=effort, kept=kept, devices=self.trainer.devices)
 
     def _init(self) -> TrainState:
         key = jax.random.key(self.experiment.seed)

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import jax
 
+from hrlspec.config import Effort
 from hrlspec.run.errors import UserError, in_words
 
 _HOST_DEVICES = "--xla_force_host_platform_device_count"
@@ -28,10 +29,14 @@ _OPTIONS = "--xla_backend_extra_options="
 # this; every release of JAX 0.10 and 0.11 knows the flag.
 _SMALL_LOOPS = "xla_cpu_small_while_loop_byte_threshold"
 _SMALL_LOOPS_BYTES = 65536
-# An iteration compiles in two thirds of the time and, under recipe hrlspec, runs as fast: its time is spent in matrix
-# products, which are not compiled here. At level 0 it takes twice as long. Zone's physics is compiled here: at level 1
-# it runs at 40 % of its speed; and so is what surrounds the products of recipe paper, which runs at 80 to 85 %.
-_QUICK: dict[str, str | bool] = {"xla_backend_optimization_level": "1", "xla_cpu_use_fusion_emitters": False}
+# Matrix products are not compiled here. What is around them runs at half its speed at level 0, and at level 1 as fast,
+# but for Zone's physics (40 %) and recipe paper. Without the fusion emitters programs compile in three quarters of the
+# time, but a hyperbolic tangent takes twice as long: Walk, whose products are small, trains at three quarters of its
+# speed, Letter at nine tenths.
+_LESS_EFFORT: dict[str, dict[str, str | bool]] = {
+    "little": {"xla_backend_optimization_level": "1"},
+    "least": {"xla_backend_optimization_level": "1", "xla_cpu_use_fusion_emitters": False},
+}
 
 
 def prepare(host_devices: int = 1) -> None:
@@ -120,17 +125,18 @@ def with_loop_option(flags: str, version: tuple[int, ...]) -> str:
     return " ".join([*words, _OPTIONS + option])
 
 
-def compiler_options(*, quick: bool) -> dict[str, str | bool]:
+def compiler_options(effort: Effort) -> dict[str, str | bool]:
     """Options for ``lowered.compile``: those that the installed XLA knows and the user's ``XLA_FLAGS`` leaves open.
 
     Args:
-        quick: whether the CPU's code is to be compiled in less time where that hardly costs speed. On other devices,
-            most code is compiled here and its speed counts, so this changes nothing there.
+        effort: what compiling for the CPU is worth. On other devices more of the code is compiled, and its speed
+            counts, so this changes nothing there.
     """
-    if not quick or jax.default_backend() != "cpu":
+    if jax.default_backend() != "cpu":
         return {}
     flags = os.environ.get("XLA_FLAGS", "")
-    return {name: value for name, value in _QUICK.items() if name not in flags and _is_known(name, value)}
+    wanted = _LESS_EFFORT.get(effort, {})
+    return {name: value for name, value in wanted.items() if name not in flags and _is_known(name, value)}
 
 
 @functools.cache

@@ -27,6 +27,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 import envs_jax
 import hrlspec
+from hrlspec.config import Effort
 from hrlspec.run.platform import compiler_options
 
 KEPT = 64
@@ -44,16 +45,17 @@ class Program:
         name: of the file.
         function: jitted, with its static arguments first.
         static: these; their ``repr`` must tell everything about them.
-        quick: compiled with those `compiler_options` that take less time.
+        effort: of the compiler; see `compiler_options`.
         kept: from one process to the next, if JAX's own cache is in use.
         devices: on how many of JAX's devices it runs, the first ones.
     """
 
     def __init__(
-        self, name: str, function: Any, *static: Any, quick: bool = False, kept: bool = True, devices: int = 1
+        self, name: str, function: Any, *static: Any, effort: Effort = "most", kept: bool = True, devices: int = 1
     ) -> None:
         self._name, self._function, self._static = name, function, static
-        self._quick, self._kept, self._devices = quick, kept, devices
+        self._effort: Effort = effort
+        self._kept, self._devices = kept, devices
         self._compiled: Callable[..., Any] | None = None
 
     def __call__(self, *args: Any) -> Any:
@@ -63,7 +65,7 @@ class Program:
         return self._compiled(*args)
 
     def _find(self, args: tuple[Any, ...]) -> Callable[..., Any]:
-        options = compiler_options(quick=self._quick)
+        options = compiler_options(self._effort)
         folder = _folder() if self._kept else None
         if folder is None:
             return self._lower(args).compile(options)

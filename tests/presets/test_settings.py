@@ -114,7 +114,11 @@ def test_what_distinguishes_the_methods(name: str, recipe: Recipe) -> None:
         # The ablations: one thing each.
         no_er, method = preset(name).settings("no-er", recipe, reward_set)
         assert no_er.relabel.share == no_er.copies_per_block == 0
-        assert dataclasses.replace(no_er, relabel=config.relabel) == config
+        assert dataclasses.replace(no_er, relabel=config.relabel, low=config.low) == config
+        assert dataclasses.replace(no_er.low, optimiser=config.low.optimiser) == config.low
+        copies = no_er.envs_per_block / (config.envs_per_block + config.copies_per_block)
+        minibatches = (some.low.optimiser.minibatches for some in (no_er, config))
+        assert next(minibatches) in (copies * (number := next(minibatches)), number)
         assert method.high == ours
         myopic, method = preset(name).settings("myopic-low", recipe, reward_set)
         assert (myopic, method.high, method.sees) == (config, ours, "sub-task")

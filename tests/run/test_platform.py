@@ -40,23 +40,24 @@ def test_the_option_for_loops(flags: str, version: tuple[int, ...], expected: st
 
 def test_options_are_those_that_xla_knows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XLA_FLAGS", "")
-    options = compiler_options(quick=True)
+    options = compiler_options("least")
     assert options["xla_backend_optimization_level"] == "1"
     assert jax.jit(lambda: 2).lower().compile(options)() == 2
-    monkeypatch.setattr(platform, "_QUICK", {**platform._QUICK, "xla_no_such_option": "1", "xla_cpu_max_isa": False})
-    assert compiler_options(quick=True) == options
+    unknown = {"xla_no_such_option": "1", "xla_cpu_max_isa": False}
+    monkeypatch.setattr(platform, "_LESS_EFFORT", {"least": {**platform._LESS_EFFORT["least"], **unknown}})
+    assert compiler_options("least") == options
 
 
 def test_the_level_of_optimisation_is_the_users_to_choose(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=true --xla_backend_optimization_level=3 --xla_a=1")
-    assert compiler_options(quick=True) == {}
+    assert compiler_options("least") == {}
 
 
 def test_what_gains_from_it_is_optimised_in_full(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XLA_FLAGS", "")
-    assert compiler_options(quick=False) == {}
+    assert compiler_options("most") == {}
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert compiler_options(quick=True) == {}
+    assert compiler_options("least") == {}
 
 
 @pytest.mark.parametrize(

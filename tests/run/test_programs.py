@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
+from hrlspec.config import Effort
 from hrlspec.run import programs
 from hrlspec.run.programs import Program
 
@@ -39,10 +40,10 @@ def folder(tmp_path: Path) -> Iterator[Path]:
     jax.config.update("jax_compilation_cache_dir", before)
 
 
-def run(factor: int = 3, size: int = 4, *, quick: bool = False) -> float:
+def run(factor: int = 3, size: int = 4, *, effort: Effort = "most") -> float:
     """As a new process would; jit's own memory is emptied first."""
     jax.clear_caches()
-    result = Program("scaled", scaled, factor, quick=quick)({"x": jnp.ones(size)}, jax.random.key(0))
+    result = Program("scaled", scaled, factor, effort=effort)({"x": jnp.ones(size)}, jax.random.key(0))
     np.testing.assert_array_equal(result["noise"], jax.random.normal(jax.random.key(0), (2,)))
     return float(result["y"].sum())
 
@@ -62,7 +63,7 @@ def test_told_apart_by_settings_and_shapes(folder: Path) -> None:
 
 def test_told_apart_by_options(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XLA_FLAGS", "")
-    assert (run(quick=True), run(), run(quick=True), run()) == (12, 12, 12, 12)
+    assert (run(effort="least"), run(), run(effort="least"), run()) == (12, 12, 12, 12)
     assert traced == [3, 3]
     assert len(list(folder.iterdir())) == 2
 

@@ -146,8 +146,8 @@ def _passes(rounds: int) -> Callable[..., Any]:
             return jax.vmap(one.fun, in_axes=tuple(axes))(weights, x, graph, remains), True
         num_nodes = remains.shape[1]
         graph = graph._replace(parent=graph.parent + num_nodes * jnp.arange(size, dtype=jnp.int32)[:, None])
-        rows = jax.tree.map(lambda leaf: leaf.reshape((-1, *leaf.shape[2:])), (x, graph, remains))
-        return _some_rounds(weights, *rows, rounds).reshape(x.shape), True
+        flat_x, graph, remains = jax.tree.map(lambda leaf: leaf.reshape((-1, *leaf.shape[2:])), (x, graph, remains))
+        return _some_rounds(weights, flat_x, graph, remains, rounds).reshape(x.shape), True
 
     return one
 

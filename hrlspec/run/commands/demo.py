@@ -126,7 +126,7 @@ def train(demo: Demo, method: str, steps: int, seed: int) -> tuple[Agent, Params
     config, nothing = trainer.agent.config, np.zeros(0, np.uint32)
     banks = TaskBanks(seed, config.curriculum, demo.env.num_propositions, nothing)
     state = trainer.init(jax.random.key(seed), banks.at(0), demo.machine)
-    iterate = Program("iterate", Trainer.iterate, trainer, quick=demo.preset.compiles_quickly("hrlspec"))
+    iterate = Program("iterate", Trainer.iterate, trainer, effort=demo.preset.effort("hrlspec"))
     with ProgressDisplay(config.num_iterations * config.steps_per_iteration, f"{demo.env.name}, {method}") as display:
         for i in range(config.num_iterations):
             state, metrics = iterate(state, banks.at(i), demo.machine, nothing)
