@@ -40,11 +40,10 @@ def preset_for(env: Environment) -> Preset:
     """
 
     def fit(settings: Settings, recipe: Recipe) -> Settings:
+        del recipe
         box = isinstance(env.action_space, Box)
         if box:
-            # As large as they are with fewer relabelled copies.
-            more = {"config.low.optimiser.minibatches": 48} if recipe == "hrlspec" else {}
-            settings = continuous(settings, learning_rate=1e-3).evolve(_FAR_GOALS | more)
+            settings = continuous(settings, learning_rate=1e-3).evolve(_FAR_GOALS)
         config = settings.config
         view = jax.eval_shape(env.proposition_view, jax.ShapeDtypeStruct(env.observation_shape, "float32"))
         numbers, side = sum(part.size for part in view), min(view[0].shape[1:], default=1)

@@ -100,9 +100,6 @@ _HRLSPEC = Settings(
             # Sharper than 0.94: a detour of two steps costs 19 % of the return.
             "discount": 0.9,
             "low.optimiser.learning_rate": 7e-4,
-            # Half the arithmetic of twice through in minibatches two and a half times as large, and no worse.
-            "low.optimiser.epochs": 1,
-            "low.optimiser.minibatches": 40,
             "low.entropy": 0.02,
             "low.final_entropy": 0.004,
             # An agent without memory or chance goes in circles for ever, and looks no farther than the nearest goal.

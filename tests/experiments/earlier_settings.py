@@ -71,7 +71,6 @@ BEFORE = {
     "config.blocks": (1,),
     "config.group": (8, 32),
     "config.low.optimiser.epochs": (2,),
-    "config.low.optimiser.minibatches": (16, 32),
 }
 """What has been changed for speed since the records were made, and what they say of it. The page of results tells."""
 
