@@ -165,7 +165,7 @@ def test_what_is_held_out_would_have_been_trained_on() -> None:
             ConfigError,
             "unknown setting 'rate' of PPOConfig, expected one of: optimiser",
         ),
-        ({"changes": {"num_envs": 7}}, ConfigError, "minibatches is 16, expected a divisor of"),
+        ({"changes": {"num_envs": 7}}, ConfigError, "blocks is 2, expected a divisor of 7"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(wrong: dict[str, Any], error: type[Exception], message: str) -> None:
