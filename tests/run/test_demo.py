@@ -27,7 +27,8 @@ def test_the_dilemma() -> None:
     assert abs(np.cross([*b, 0], [*a, 0])[2]) / np.linalg.norm(b) < 0.7
 
 
-@pytest.mark.parametrize("world", ["rooms", pytest.param("dilemma", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("world", ["rooms", "dilemma"])
 def test_what_is_drawn(world: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     """The whole command, with agents that have learned nothing."""
 
