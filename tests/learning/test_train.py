@@ -280,6 +280,7 @@ def test_the_planner_picks_the_shorter_branch() -> None:
     assert (chosen[:, 2] > least).all()  # b lies on the way to c
 
 
+@pytest.mark.slow
 def test_the_planner_knows_the_values() -> None:
     """γ^(steps - 1), the return of the best branch."""
     # The largest error, over 20 seeds at three instruction sets: 0.034 ± 0.020, at most 0.094.
