@@ -152,8 +152,7 @@ class HighLevel(abc.ABC):
     ) -> Judgement:
         """What it thinks where there is nothing to choose; ``worth`` is V^l of the one way there is."""
         del worth
-        choice = self.choose(low, params, view, tree, state, instructions)
-        return Judgement(choice.value, choice.advice)
+        return self.judge(low, params, view, tree, state, instructions)
 
     def low_level_rewards(self, experience: Experience) -> Rewards:
         """What the low level is paid, and when that ends: the task's rewards, until the episode ends."""

@@ -32,7 +32,7 @@ _SMALL_LOOPS_BYTES = 65536
 # Matrix products are not compiled here. What is around them runs at half its speed at level 0, and at level 1 as fast,
 # but for Zone's physics (40 %) and recipe paper. Without the fusion emitters programs compile in three quarters of the
 # time, but a hyperbolic tangent takes twice as long: Walk, whose products are small, trains at three quarters of its
-# speed, Letter at nine tenths.
+# speed. Letter, measured twice, was once a tenth slower and once no slower.
 _LESS_EFFORT: dict[str, dict[str, str | bool]] = {
     "little": {"xla_backend_optimization_level": "1"},
     "least": {"xla_backend_optimization_level": "1", "xla_cpu_use_fusion_emitters": False},

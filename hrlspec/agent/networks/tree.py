@@ -56,11 +56,11 @@ def forks(tree: TaskTree) -> Bool[Array, " N"]:
     """Whether more than one way leads on from a node or from one below it, bool ``[N]``."""
     several = jnp.zeros(tree.num_nodes, jnp.int32).at[tree.parent].add(tree.edges.astype(jnp.int32)) > 1
 
-    def visit(fork: Bool[Array, " N"], node: Int32[Array, ""]) -> tuple[Bool[Array, " N"], None]:
-        return fork.at[tree.parent[node]].max(fork[node] & tree.edges[node]), None
+    def visit(fork: Bool[Array, " N"], node: Int32[Array, ""]) -> tuple[Bool[Array, " N"], Bool[Array, ""]]:
+        return fork.at[tree.parent[node]].max(fork[node] & tree.edges[node]), fork[node]
 
-    # Children come after their parents, so the last node is visited first.
-    return jax.lax.scan(visit, several, jnp.arange(tree.num_nodes, dtype=jnp.int32), reverse=True)[0]
+    found: Bool[Array, " N"] = sweep_up(visit, several)
+    return found
 
 
 def lookback(tree: TaskTree, depth: int) -> Bool[Array, "N D P"]:
