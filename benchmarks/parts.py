@@ -99,7 +99,7 @@ def parts(name: str, recipe: Recipe, iterations: int, seconds: float) -> dict[st
     experience = timed("build", relabelled, state.params, book, steps)
     each = trainer.shards.each_block
     learn(
-        functools.partial(each, functools.partial(low_batch, agent)),
+        functools.partial(each, functools.partial(low_batch, agent, state.params)),
         lambda p, sample: low_level_loss(agent.low, p, sample, config.low, progress),
         config.low.optimiser,
         "low",

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float32, Int32, Shaped
 
 from envs_jax import Environment
 from envs_jax.arrays import Array
+from hrlspec.agent.networks.controller import Sight
 from hrlspec.spec import TaskState, TaskTree
 
 
@@ -146,7 +147,7 @@ class LowBatch:
 
     trees: TaskTree
     slot: Int32[Array, "V T"]  # which of the trees
-    view: View
+    sight: Sight
     edge: Int32[Array, "V T"]  # the edge in force
     ahead: Float32[Array, "V T D P"]  # reach sets of the sub-tasks planned after it
     feasible: Bool[Array, "V T _"]  # [V, T, N], the open edges; empty unless conditioned on the whole task

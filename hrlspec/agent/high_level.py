@@ -140,20 +140,6 @@ class HighLevel(abc.ABC):
         choice = self.choose(low, params, view, tree, state, instructions)
         return Judgement(choice.value, choice.advice)
 
-    def judge_settled(
-        self,
-        low: LowLevel,
-        params: Params,
-        view: View,
-        tree: TaskTree,
-        state: TaskState,
-        instructions: Instruction,
-        worth: Float32[Array, " B"],
-    ) -> Judgement:
-        """What it thinks where there is nothing to choose; ``worth`` is V^l of the one way there is."""
-        del worth
-        return self.judge(low, params, view, tree, state, instructions)
-
     def low_level_rewards(self, experience: Experience) -> Rewards:
         """What the low level is paid, and when that ends: the task's rewards, until the episode ends."""
         outcome = experience.outcome

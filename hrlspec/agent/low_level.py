@@ -1,7 +1,7 @@
 """The low level: its instruction, its policy and value, and the reach critic of its shield.
 
 Axes: **N** tree nodes, **P** atomic propositions, **D** later sub-tasks, **K** candidate actions, **M** tasks,
-**B** environments of a batch.
+**B** environments of a batch, **V** environments and relabelled copies, **T** time steps, **S** episodes of one.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from envs_jax.arrays import Array
 from hrlspec.agent.distributions import Distribution, distribution_over
 from hrlspec.agent.experience import View
 from hrlspec.agent.groups import take
-from hrlspec.agent.networks.controller import Controller, Instruction, Sees
+from hrlspec.agent.networks.controller import Controller, Instruction, Sees, Sight
 from hrlspec.agent.networks.reach_critic import ReachCritic
 from hrlspec.agent.networks.tree import forks
 from hrlspec.config import Config
@@ -117,11 +117,42 @@ class LowLevel:
         behind = jnp.zeros((*edge.shape, 0, instructions.reach.shape[-1]), jnp.float32)
         return Instruction(reach=nothing, avoid=nothing, ahead=ahead, behind=behind, future=cast(Array, future))
 
+    def instructions_of(
+        self,
+        params: Params,
+        trees: TaskTree,
+        slot: Int32[Array, "V T"],
+        edge: Int32[Array, "V T"],
+        feasible: Bool[Array, "V T _"],
+        ahead: Float32[Array, "V T D P"],
+    ) -> Instruction:
+        """The instructions at all steps ``[V, T]`` of rollouts whose tasks are ``trees``, leading axes ``[V, S]``.
+
+        Args:
+            params: the networks' parameters.
+            trees: the tasks of each environment's episodes.
+            slot: int32 ``[V, T]``, which of them.
+            edge, feasible, ahead: as in `instructions_at`.
+        """
+        instructions = jax.vmap(jax.vmap(self.instruct, in_axes=(None, 0)), in_axes=(None, 0))(params, trees)
+        row = jnp.arange(slot.shape[0], dtype=jnp.int32)[:, None]
+        return self.instructions_at(params, instructions, (row, slot), edge, feasible, ahead)
+
     def control(
         self, params: Params, view: View, instruction: Instruction
     ) -> tuple[Float32[Array, " outputs"], Float32[Array, ""]]:
         """What describes the policy on one environment (see ``actions``), and the value ``[]``."""
         return cast("tuple[Array, Array]", self.controller.apply(params["low"], view, instruction))
+
+    def see(self, view: View, instruction: Instruction) -> Sight:
+        """What `control` makes of one observation before its parameters: worth keeping between epochs."""
+        return cast(Sight, self.controller.apply({}, view, instruction, method="see"))
+
+    def respond(
+        self, params: Params, sight: Sight, instruction: Instruction
+    ) -> tuple[Float32[Array, " outputs"], Float32[Array, ""]]:
+        """What `control` makes of what `see` gave it."""
+        return cast("tuple[Array, Array]", self.controller.apply(params["low"], sight, instruction, method="respond"))
 
     def value_of(
         self,

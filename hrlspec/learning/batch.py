@@ -15,14 +15,15 @@ from envs_jax.arrays import Array
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.experience import Credit, Experience, HighBatch, LowBatch
 from hrlspec.agent.groups import take
+from hrlspec.agent.low_level import Params
 from hrlspec.config import PPOConfig
 from hrlspec.learning import ppo
 from hrlspec.learning.targets import high_level_targets, low_level_targets
 from hrlspec.spec import open_edges
 
 
-def low_batch(agent: Agent, x: Experience) -> LowBatch:
-    """All steps as samples of the low level."""
+def low_batch(agent: Agent, params: Params, x: Experience) -> LowBatch:
+    """All steps as samples of the low level; what it sees needs no parameters, and is the same in every epoch."""
     config = agent.config
     rewards = agent.high.low_level_rewards(x)
     target = low_level_targets(
@@ -32,13 +33,15 @@ def low_batch(agent: Agent, x: Experience) -> LowBatch:
         max_operator=agent.high.max_operator,
     ).T
     advantage = ppo.scaled(target - x.low.value, x.low.value, config.low)
+    feasible = _feasible(agent, x)
+    now = agent.low.instructions_of(params, x.trees, x.slot, x.high.edge, feasible, x.high.ahead)
     return LowBatch(
         trees=x.trees,
         slot=x.slot,
-        view=x.view,
+        sight=jax.vmap(jax.vmap(agent.low.see))(x.view, now),
         edge=x.high.edge,
         ahead=x.high.ahead,
-        feasible=_feasible(agent, x),
+        feasible=feasible,
         decision=x.low,
         credit=Credit(advantage=advantage, target=target, learns=x.learns_low, valid=x.valid),
     )

@@ -122,11 +122,9 @@ def low_level_loss(
         progress: float32 ``[]``, share of the training that is done.
     """
     own = {"low": params}
-    instructions = jax.vmap(jax.vmap(low.instruct, in_axes=(None, 0)), in_axes=(None, 0))(own, batch.trees)
-    row = jnp.arange(batch.slot.shape[0], dtype=jnp.int32)[:, None]
-    now = low.instructions_at(own, instructions, (row, batch.slot), batch.edge, batch.feasible, batch.ahead)
-    view, instructions, decision, credit = jax.tree.map(flat, (batch.view, now, batch.decision, batch.credit))
-    outputs, value = jax.vmap(low.control, in_axes=(None, 0, 0))(own, view, instructions)
+    now = low.instructions_of(own, batch.trees, batch.slot, batch.edge, batch.feasible, batch.ahead)
+    sight, instructions, decision, credit = jax.tree.map(flat, (batch.sight, now, batch.decision, batch.credit))
+    outputs, value = jax.vmap(low.respond, in_axes=(None, 0, 0))(own, sight, instructions)
     log_prob = jax.vmap(low.actions.log_prob)(outputs, decision.action)
     entropy = jax.vmap(low.actions.entropy)(outputs)
     return loss(log_prob, decision.log_prob, value, entropy, credit, settings, progress)

@@ -128,35 +128,58 @@ def collect(
         Where this one stopped, and its steps, leading axes ``[T, E]``.
     """
     agent = setting.agent
-    num_envs, num_steps = setting.envs.shape[0], agent.config.num_steps
+    num_envs = setting.envs.shape[0]
     chance = _draw(key, setting, correlation)
-    last = jnp.arange(num_steps, dtype=jnp.int32) == num_steps - 1
     collector = dataclasses.replace(collector, started=jnp.zeros(num_envs, jnp.int32))
     reach = _reach_values(setting, collector.worker.view)
-    (collector, _), steps = jax.lax.scan(functools.partial(_step, setting), (collector, reach), (chance, last))
+    (collector, _), steps = jax.lax.scan(functools.partial(_step, setting), (collector, reach), chance)
     silence = jnp.zeros((num_envs, *agent.low.actions.noise_shape), jnp.float32)
-    value = _act(setting, collector.worker, silence, None).value
-    value = jnp.where(steps.outcome.truncated[-1], steps.bootstrap.low[-1], value)
-    bootstrap = dataclasses.replace(steps.bootstrap, low=steps.bootstrap.low.at[-1].set(value))
-    high = _with_values(setting, steps) if agent.high.uses_values else steps.high
+    worth = _act(setting, collector.worker, silence, None).value
+    high, value = steps.high, worth
+    if agent.high.uses_values:
+        high, value = _with_values(setting, steps, collector.worker, worth)
+    truncated, before = steps.outcome.truncated[-1], steps.bootstrap.high
+    bootstrap = jax.tree.map(lambda x: before.at[-1].set(jnp.where(truncated, before[-1], x)), Bootstrap(worth, value))
     return collector, dataclasses.replace(steps, bootstrap=bootstrap, high=high)
 
 
-def _with_values(setting: Setting, steps: Step) -> HighDecision:
-    """The decisions with V^h also where there was nothing to choose, many at a time: acting did not wait for them."""
+def _with_values(
+    setting: Setting, steps: Step, end: Worker, worth: Float32[Array, " E"]
+) -> tuple[HighDecision, Float32[Array, " E"]]:
+    """V^h where acting did not wait for it: at decisions without a choice, and of the states in the end.
+
+    A low level that is told the one way there is knows what that is worth: V^l, ``worth`` in the end, is V^h then.
+    """
     agent, book = setting.agent, setting.book
-    rows = jax.tree.map(flat, (steps.view, steps.task, steps.state, steps.low.value))
-    high, task, state = jax.tree.map(flat, steps.high), rows[1], rows[2]
-    settled = agent.high.settled(task_of(book, task), state, book.forks[task]) != TaskTree.NO_NODE
+    rows = jax.tree.map(flat, (steps.view, steps.task, steps.state))
+    last = (end.view, end.task, end.task_state)
+    settled, settled_last = (
+        agent.high.settled(task_of(book, task), state, book.forks[task]) != TaskTree.NO_NODE
+        for _, task, state in (rows, last)
+    )
 
-    def judge(inputs: tuple[View, Int32[Array, " B"], TaskState, Float32[Array, " B"]]) -> Judgement:
-        view, task, state, worth = inputs
+    def judge(inputs: tuple[View, Int32[Array, " B"], TaskState]) -> Judgement:
+        view, task, state = inputs
         tree, instructions = take((book.tree, book.instructions), task)
-        return agent.high.judge_settled(agent.low, setting.params, view, tree, state, instructions, worth)
+        choice = agent.high.choose(agent.low, setting.params, view, tree, state, instructions)
+        return Judgement(choice.value, choice.advice)
 
-    known = in_groups(judge, high.made & settled, rows, Judgement(high.value, high.advice), JUDGED_AT_ONCE)
-    value, advice = jax.tree.map(lambda x: x.reshape((*steps.task.shape, *x.shape[1:])), known)
-    return dataclasses.replace(steps.high, value=value, advice=advice)
+    made, value, advice = jax.tree.map(flat, (steps.high.made, steps.high.value, steps.high.advice))
+    unknown = Judgement(worth, jnp.zeros_like(advice[: len(worth)]))
+    if agent.high.follows_plan and agent.method.sees == "future":
+        low = flat(steps.low.value)
+        known = Judgement(jnp.where(settled, low, value), jnp.where(settled[:, None], low[:, None], advice))
+        value_last = in_groups(judge, ~settled_last, last, unknown, JUDGED_AT_ONCE).value
+    else:
+        rows, known, asked = jax.tree.map(
+            lambda *x: jnp.concatenate(x),
+            (rows, Judgement(value, advice), made & settled),
+            (last, unknown, jnp.ones_like(settled_last)),
+        )
+        known = in_groups(judge, asked, rows, known, JUDGED_AT_ONCE)
+        known, value_last = jax.tree.map(lambda x: x[: len(value)], known), known.value[len(value) :]
+    value, advice = jax.tree.map(lambda x: x.reshape((*steps.task.shape, *x.shape[1:])), tuple(known))
+    return dataclasses.replace(steps.high, value=value, advice=advice), value_last
 
 
 def _draw(key: Key[Array, ""], setting: Setting, correlation: Float32[Array, ""] | float) -> _Chance:
@@ -180,12 +203,10 @@ _Reach = Float32[Array, "E P K"] | None
 """Q(s, g, a) of the states that the next action is taken in; ``None`` without a shield."""
 
 
-def _step(
-    setting: Setting, carry: tuple[Collector, _Reach], inputs: tuple[_Chance, Bool[Array, ""]]
-) -> tuple[tuple[Collector, _Reach], Step]:
+def _step(setting: Setting, carry: tuple[Collector, _Reach], chance: _Chance) -> tuple[tuple[Collector, _Reach], Step]:
     """One step of all environments: act, step the worlds, restart what ended, decide what is due."""
     agent, book, pool = setting.agent, setting.book, setting.pool
-    (collector, reach), (chance, last) = carry, inputs
+    collector, reach = carry
     before, num_envs = collector.worker, collector.level.shape[0]
     low = _act(setting, before, chance.low, reach)
     step_keys, reset_keys = jax.vmap(jax.random.split, out_axes=1)(chance.keys)
@@ -196,7 +217,7 @@ def _step(
     begun = start(reset_keys, agent.env, setting.machine, book, fresh.layout, fresh.task)
     after = where(ended, begun, worker)
     reached = _reach_values(setting, worker.view)
-    decision, bootstrap = _plan(setting, after, worker, outcome.truncated, last, chance.high)
+    decision, bootstrap = _plan(setting, after, worker, outcome.truncated, chance.high)
     record = Step(
         view=before.view,
         task=before.task,
@@ -241,22 +262,20 @@ def _plan(
     after: Worker,
     ended: Worker,
     truncated: Bool[Array, " E"],
-    last: Bool[Array, ""],
     noise: Float32[Array, "E N"],
 ) -> tuple[HighDecision, Float32[Array, " E"]]:
-    """Decisions for the next step, and V^h of the states that this one led to, where they are needed.
+    """Decisions for the next step, and V^h of the states that this one truncated.
 
-    One pass of the high level serves the decisions that are due, the values of truncated states, and in the end those
-    of all states reached: compiled once.
+    One pass of the high level serves both: compiled once.
     """
     num_envs, due = truncated.shape[0], after.awaiting
     both = jax.tree.map(lambda *x: jnp.concatenate(x), after, ended)
     nowhere = jnp.zeros_like(due)
-    valued = jnp.concatenate([nowhere | last, truncated])
+    valued = jnp.concatenate([nowhere, truncated])
     noise = jnp.concatenate([noise, jnp.zeros_like(noise)])
     due_of_both = jnp.concatenate([due, nowhere])
     planned = decide(setting.agent, setting.params, setting.book, both, due_of_both, noise, valued)
-    bootstrap = jnp.where(truncated, planned.value[num_envs:], planned.value[:num_envs])
+    bootstrap = planned.value[num_envs:]
     planned = jax.tree.map(lambda x: x[:num_envs], planned)
     in_force = after.decision
     decision = dataclasses.replace(

@@ -214,7 +214,7 @@ class Trainer:
         keys = dict(zip(("low", "high", "reach_critic"), jax.random.split(key, 3), strict=True))
         lessons: dict[str, tuple[Any, Any]] = {
             "low": (
-                self.shards.each_block(functools.partial(low_batch, agent), experience),
+                self.shards.each_block(functools.partial(low_batch, agent, state.params), experience),
                 lambda p, sample: low_level_loss(agent.low, p, sample, config.low, progress),
             )
         }

@@ -106,21 +106,6 @@ class ImplicitPlanner(Checked, HighLevel):
             jnp.zeros(state.node.shape, jnp.float32), self.advise(low, params, view, tree, state, instructions)[0]
         )
 
-    def judge_settled(
-        self,
-        low: LowLevel,
-        params: Params,
-        view: View,
-        tree: TaskTree,
-        state: TaskState,
-        instructions: Instruction,
-        worth: Float32[Array, " B"],
-    ) -> Judgement:
-        """See :class:`HighLevel`; where one way is open, its value is all that `advise` would find."""
-        del instructions
-        advice = jnp.broadcast_to((self.network.advice > 0) * worth[:, None], tree.parent.shape)
-        return Judgement(self._plan(low, params["high"], view, tree, state, advice)[1], advice)
-
     def advise(
         self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, instructions: Instruction
     ) -> tuple[Float32[Array, "B N"], Float32[Array, "B N D P"]]:
@@ -147,7 +132,7 @@ class ImplicitPlanner(Checked, HighLevel):
 
         env = jnp.repeat(jnp.arange(known.shape[0], dtype=jnp.int32), num_paths)
         flat_paths = jax.tree.map(lambda x: x.reshape((known.size, *x.shape[2:])), paths)
-        group = known.shape[0]
+        group = max(known.shape[0], 16)  # of fewer rows a matrix product costs nearly as much
         values = in_groups(value, known.reshape(-1), (env, flat_paths), jnp.zeros(env.shape, jnp.float32), group)
         advice, ahead = jax.vmap(_best_paths)(edge, known, values.reshape(known.shape), paths.ahead, instructions.ahead)
         return jax.lax.stop_gradient(advice), ahead

@@ -83,7 +83,7 @@ def batches(agent: Agent, key: jax.Array, params: Any, book: TaskBook, steps: St
     blocks = gather(relabel_key, agent, params, machine(), book, steps, jnp.zeros(1, jnp.uint32), jnp.arange(E))
     experience = jax.tree.map(lambda x: x[0], blocks)
     assert agent.high.ppo is not None
-    return low_batch(agent, experience), high_batch(pick_key, agent, experience, agent.high.ppo)
+    return low_batch(agent, params, experience), high_batch(pick_key, agent, experience, agent.high.ppo)
 
 
 @quick_jit
@@ -123,6 +123,12 @@ def book() -> TaskBook:
 @pytest.fixture
 def t() -> Step:
     return rollouts()[2].trajectory
+
+
+def ways(tree: TaskTree, node: int, lost: Any = None) -> int:
+    """How many paths to a leaf are open; those that begin with a lost edge are not."""
+    children = [i for i in np.flatnonzero(tree.parent == node) if tree.valid[i] and (lost is None or not lost[i])]
+    return sum(ways(tree, i) for i in children) or int(tree.accepting[node])
 
 
 def tree_of_row(book: TaskBook, row: int) -> TaskTree:
@@ -318,7 +324,12 @@ def test_decisions_log_probabilities_and_values(book: TaskBook, t: Step) -> None
     made = t.high.made.ravel()
     expected = log_probs(logits, t.high.edge.ravel())[made]
     np.testing.assert_allclose(t.high.log_prob.ravel()[made], expected, atol=1e-5)
-    np.testing.assert_allclose(t.high.value.ravel()[made], np.asarray(value)[made], atol=1e-5)
+    # Where one way is left to the end, V^h is what the low level expects of it.
+    nodes, lost = t.state.node.ravel(), t.state.blocked.reshape(T * E, -1)
+    one_way = np.array([ways(tree_of_row(book, task), *at) == 1 for task, *at in zip(t.task.ravel(), nodes, lost)])
+    worth = np.where(one_way, t.low.value.ravel(), np.asarray(value))
+    np.testing.assert_allclose(t.high.value.ravel()[made], worth[made], atol=1e-5)
+    assert 10 < (made & one_way).sum() < made.sum() - 10
     assert (expected < -0.1).sum() > 10  # there were choices
 
 
@@ -344,7 +355,6 @@ def test_cut_episodes_bootstrap_with_the_state_they_were_cut_in(book: TaskBook, 
         np.testing.assert_allclose(bootstrap[t.outcome.truncated], value[t.outcome.truncated], atol=1e-5)
     going_on = ~(t.outcome.terminated | t.outcome.truncated)[-1]
     assert going_on.sum() > 5
-    np.testing.assert_allclose(t.bootstrap.high[-1][going_on], value[-1][going_on], atol=1e-5)
     after = rollouts()[2].after.worker
     instruction = jax.tree.map(lambda x: x[after.task, after.decision.edge], book.instructions)
     instruction = jax.tree.map(
@@ -353,6 +363,11 @@ def test_cut_episodes_bootstrap_with_the_state_they_were_cut_in(book: TaskBook, 
     views = jax.tree.map(lambda x: np.repeat(x, T, 0), after.view)
     low = np.asarray(control(params(), views, instruction)[1])[::T]
     np.testing.assert_allclose(t.bootstrap.low[-1][going_on], low[going_on], atol=1e-5)
+    at = zip(after.task, after.task_state.node, after.task_state.blocked, strict=True)
+    one_way = np.array([ways(tree_of_row(book, task), node, lost) == 1 for task, node, lost in at])
+    high = np.where(one_way, low, value[-1])
+    np.testing.assert_allclose(t.bootstrap.high[-1][going_on], high[going_on], atol=1e-5)
+    assert 0 < one_way[going_on].sum() < going_on.sum()
 
 
 # --- Batches ---
@@ -380,7 +395,7 @@ def low_log_probs(params: Any, low: LowBatch) -> jax.Array:
     row = jnp.arange(low.slot.shape[0])[:, None]
     instruction = jax.tree.map(lambda x: x[row, low.slot, low.edge], instruction)
     instruction = dataclasses.replace(instruction, ahead=low.ahead)
-    logits, _ = jax.vmap(jax.vmap(AGENT.low.control, (None, 0, 0)), (None, 0, 0))(params, low.view, instruction)
+    logits, _ = jax.vmap(jax.vmap(AGENT.low.respond, (None, 0, 0)), (None, 0, 0))(params, low.sight, instruction)
     return jnp.take_along_axis(jax.nn.log_softmax(logits), low.decision.action[..., None], -1)[..., 0]
 
 
@@ -401,7 +416,7 @@ def test_ratios_are_one_at_the_start_of_the_update() -> None:
 
 def test_copies_keep_the_probability_that_their_actions_were_drawn_with(t: Step) -> None:
     low, plan = rollouts()[2].low, rollouts()[2].plan
-    copied = [next(e for e in range(E) if (low.view[1][E + i] == low.view[1][e]).all()) for i in range(E)]
+    copied = [next(e for e in range(E) if (low.sight.shared[E + i] == low.sight.shared[e]).all()) for i in range(E)]
     assert sorted(copied) == list(range(E))
     np.testing.assert_array_equal(low.decision.log_prob[E:], t.low.log_prob.T[copied])
     # The path of a copy is what happened: it was no choice. All other decisions are the rollout's.
@@ -451,7 +466,7 @@ def test_without_unfinished_every_sample_was_completed() -> None:
 
     @quick_jit
     def rebuild(book: TaskBook, t: Step) -> HighBatch:
-        return batches(agent, jax.random.key(0), {}, book, t)[1]
+        return batches(agent, jax.random.key(0), params(), book, t)[1]
 
     plan = jax.tree.map(np.asarray, rebuild(bank, t))
     completed = 0

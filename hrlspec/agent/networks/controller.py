@@ -1,19 +1,19 @@
 """The low level: a policy and value conditioned on the assigned sub-task and on what remains after it.
 
 Paper, "Low-level Module". Axes: **N** tree nodes, **P** atomic propositions, **G** channels, **D** later sub-tasks,
-**C** completed sub-tasks, **F** features.
+**C** completed sub-tasks, **F** features, **A** actions or their components.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Shaped
 
 from envs_jax import Reflections, Symmetries
 from envs_jax.arrays import Array
@@ -42,6 +42,14 @@ class Instruction:
     ahead: Float32[Array, "*lead D P"]
     behind: Float32[Array, "*lead C P"]
     future: Float32[Array, "*lead F"]
+
+
+class Sight(NamedTuple):
+    """What the low level sees of the world on a sub-task, before any of its parameters."""
+
+    planes: Planes
+    shared: Shared
+    frame: Shaped[Array, " A"] | None  # places of the actions, or their signs, in the form of the world that is seen
 
 
 Sees = Literal["future", "sub-task", "whole task"]
@@ -101,6 +109,36 @@ class Controller(nn.Module):
         """Embedding of what remains while some edges are open (bool ``[..., N]``), ``[..., F]``."""
         return self.task_embedding.of_edges(messages, edges)
 
+    def see(self, view: tuple[Planes, Shared], instruction: Instruction) -> Sight:
+        """What is seen on a sub-task, by role and turned or reflected where the settings say so.
+
+        Args:
+            view: the observation, as ``env.proposition_view`` gives it.
+            instruction: the assigned sub-task and what follows.
+        """
+        planes, shared = view
+        if not self.config.roles:
+            return Sight(planes, shared, None)
+        planes, lookahead = self._by_role(planes, instruction), instruction.ahead.shape[0]
+        if self.config.symmetric and isinstance(self.symmetries, Symmetries):
+            planes, order = turn(planes, self.symmetries, lookahead)
+            return Sight(planes, shared, order)
+        if self.config.symmetric and isinstance(self.symmetries, Reflections):
+            return Sight(*reflect(planes, shared, self.symmetries, lookahead))
+        return Sight(planes, shared, None)
+
+    def respond(self, sight: Sight, instruction: Instruction) -> tuple[Float32[Array, " outputs"], Float32[Array, ""]]:
+        """The actor's outputs ``[num_outputs]`` and the value ``[]`` of what is seen, see `__call__`."""
+        latent = nn.relu(self.encoder(sight.planes, sight.shared))
+        x = jnp.concatenate([latent, *self._of_task(instruction)])
+        outputs, frame = self.actor(x), sight.frame
+        if frame is not None and isinstance(self.symmetries, Symmetries):
+            outputs = outputs[frame]
+        elif frame is not None:
+            # The outputs are means and deviations: a mean changes its sign with the action, its deviation does not.
+            outputs = outputs * jnp.concatenate([frame, jnp.ones(self.num_outputs - len(frame), jnp.float32)])
+        return outputs, self.critic(x)[0]
+
     def __call__(
         self, view: tuple[Planes, Shared], instruction: Instruction
     ) -> tuple[Float32[Array, " outputs"], Float32[Array, ""]]:
@@ -113,23 +151,7 @@ class Controller(nn.Module):
         Returns:
             The actor's outputs ``[num_outputs]`` and the value ``[]``.
         """
-        planes, shared = view
-        order = signs = None
-        if self.config.roles:
-            planes = self._by_role(planes, instruction)
-            if self.config.symmetric and isinstance(self.symmetries, Symmetries):
-                planes, order = turn(planes, self.symmetries, instruction.ahead.shape[0])
-            elif self.config.symmetric and isinstance(self.symmetries, Reflections):
-                planes, shared, signs = reflect(planes, shared, self.symmetries, instruction.ahead.shape[0])
-        latent = nn.relu(self.encoder(planes, shared))
-        x = jnp.concatenate([latent, *self._of_task(instruction)])
-        outputs = self.actor(x)
-        if order is not None:
-            outputs = outputs[order]
-        elif signs is not None:
-            # The outputs are means and deviations: a mean changes its sign with the action, its deviation does not.
-            outputs = outputs * jnp.concatenate([signs, jnp.ones(self.num_outputs - len(signs), jnp.float32)])
-        return outputs, self.critic(x)[0]
+        return self.respond(self.see(view, instruction), instruction)
 
     def everything(
         self, view: tuple[Planes, Shared], tree: TaskTree

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float32, Int32
 
 from envs_jax.arrays import Array
 from hrlspec.agent.networks.encoder import initializer
+from hrlspec.agent.networks.rows import where_needed
 from hrlspec.agent.networks.tree import sweep_up
 from hrlspec.spec import TaskState, TaskTree, subtask_avoid
 
@@ -147,25 +148,15 @@ def _passes(rounds: int) -> Callable[..., Any]:
         num_nodes = remains.shape[1]
         graph = graph._replace(parent=graph.parent + num_nodes * jnp.arange(size, dtype=jnp.int32)[:, None])
         flat_x, graph, remains = jax.tree.map(lambda leaf: leaf.reshape((-1, *leaf.shape[2:])), (x, graph, remains))
-        return _some_rounds(weights, flat_x, graph, remains, rounds).reshape(x.shape), True
+
+        def of_rows(rows: tuple[Any, Graph], place: Int32[Array, " R"]) -> Float32[Array, "r F"]:
+            few_x, few = rows
+            return _rounds(weights, few_x, few._replace(parent=place[few.parent]), rounds)
+
+        found = where_needed(of_rows, remains, (flat_x, graph), most=3 * remains.size // 8)
+        return found.reshape(x.shape), True
 
     return one
-
-
-def _some_rounds(
-    weights: Any, x: Float32[Array, "R F"], graph: Graph, remains: Bool[Array, " R"], rounds: int
-) -> Float32[Array, "R F"]:
-    """Rounds over the rows that remain, if they are no more than half: most are padding, or other branches."""
-    num_rows = len(x)
-
-    def some() -> Float32[Array, "R F"]:
-        rows = jnp.nonzero(remains, size=num_rows // 2, fill_value=num_rows)[0]
-        place = jnp.cumsum(remains, dtype=jnp.int32) - 1
-        few_x, few = jax.tree.map(lambda leaf: leaf.at[rows].get(mode="fill", fill_value=0), (x, graph))
-        found = _rounds(weights, few_x, few._replace(parent=place[few.parent]), rounds)
-        return jnp.zeros_like(x).at[rows].set(found, mode="drop")
-
-    return jax.lax.cond(remains.sum() <= num_rows // 2, some, lambda: _rounds(weights, x, graph, rounds))
 
 
 def _rounds(weights: Any, x: Float32[Array, "R F"], graph: Graph, rounds: int) -> Float32[Array, "R F"]:

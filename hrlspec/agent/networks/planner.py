@@ -6,8 +6,12 @@ Axes: **N** tree nodes, **P** atomic propositions, **F** features.
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, cast
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float32
 
@@ -15,6 +19,7 @@ from envs_jax.arrays import Array
 from hrlspec.agent.distributions import MASKED
 from hrlspec.agent.networks.encoder import MLP, Encoder, Planes, Shared, initializer
 from hrlspec.agent.networks.messages import Rounds, Sweep
+from hrlspec.agent.networks.rows import where_needed
 from hrlspec.agent.networks.transition import Transition
 from hrlspec.config import Checked, NetworkConfig, setting
 from hrlspec.spec import TaskState, TaskTree, open_edges, subtask_avoid
@@ -38,6 +43,32 @@ class PlannerConfig(Checked):
     advice: float = setting(0.0, least=0, most=1e6)
     """Weight of the low level's value of each candidate sub-task in the logits (gradient stopped); the planner learns a
     correction to it. 0: the planner judges alone, as in the paper."""
+
+
+@functools.cache
+def _at_edges(policy: MLP) -> Callable[..., Any]:
+    """The policy at every edge of a tree, or, of many trees, at the open ones alone: few of the nodes are."""
+
+    @jax.custom_batching.custom_vmap
+    def one(variables: Any, edges: Float32[Array, "N F"], feasible: Bool[Array, " N"]) -> Float32[Array, "N 1"]:
+        del feasible
+        return cast(Array, policy.apply(variables, edges))
+
+    @one.def_vmap
+    def many(
+        size: int, batched: Any, variables: Any, edges: Float32[Array, "B N F"], feasible: Bool[Array, "B N"]
+    ) -> tuple[Float32[Array, "B N 1"], bool]:
+        del size
+        if any(jax.tree.leaves(batched[0])) or not all(batched[1:]):
+            axes = jax.tree.map(lambda yes: 0 if yes else None, batched)
+            return jax.vmap(one.fun, in_axes=tuple(axes))(variables, edges, feasible), True
+        rows = edges.reshape(-1, edges.shape[-1])
+        found = where_needed(
+            lambda some, _: cast(Array, policy.apply(variables, some)), feasible.reshape(-1), rows, len(rows) // 4
+        )
+        return found.reshape(*feasible.shape, 1), True
+
+    return one
 
 
 class Planner(nn.Module):
@@ -102,6 +133,9 @@ class Planner(nn.Module):
         behind = jnp.where(feasible, self.config.advice * (advice - best), 0.0)
         if self.config.advice:
             inputs.append(behind[:, None])
-        logits = self.policy(jnp.concatenate([x.astype(jnp.float32) for x in inputs], -1))[:, 0] + behind
+        edges = jnp.concatenate([x.astype(jnp.float32) for x in inputs], -1)
+        if self.is_initializing():
+            self.policy(edges)
+        logits = _at_edges(self.policy.clone(parent=None))(self.policy.variables, edges, feasible)[:, 0] + behind
         value = self.value(root)[0] + best
         return jnp.where(feasible, logits, MASKED), value

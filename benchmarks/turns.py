@@ -1,0 +1,140 @@
+"""Training speed of several checkouts, by processes that live side by side and take turns; JSON.
+
+python -m benchmarks.turns before=../before:1 before=../before:2 now=.:2 [--env letter] [--recipe hrlspec] [--out FILE]
+
+Each contestant is ``NAME=CHECKOUT:DEVICES``; ratios are to the first. Machines that are shared change their speed by a
+third within minutes, so what ran one after the other cannot be compared; what takes turns every few seconds can.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import statistics
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from hrlspec.presets import Recipe
+
+_CONTESTANT = """
+import importlib.metadata, json, sys, time
+name, recipe, devices, changes = sys.argv[1], sys.argv[2], int(sys.argv[3]), json.loads(sys.argv[4])
+from hrlspec.run.platform import prepare
+prepare(host_devices=devices)
+import jax, jax.numpy as jnp
+from benchmarks.common import learner, programs
+from hrlspec.config import evolve
+trainer, bank, machine = learner(name, recipe, devices)
+tuples = {key: tuple(value) if isinstance(value, list) else value for key, value in changes.items()}
+trainer = evolve(trainer, {"agent." + key: value for key, value in tuples.items()})
+init, iterate = programs(name, recipe, trainer)
+state, nothing = init(jax.random.key(0), bank, machine), jnp.zeros(1, jnp.uint32)
+before = time.perf_counter()
+state, _ = jax.block_until_ready(iterate(state, bank, machine, nothing))
+print(trainer.agent.config.steps_per_iteration, time.perf_counter() - before, jax.__version__, flush=True)
+for line in sys.stdin:
+    before = time.perf_counter()
+    for _ in range(int(line)):
+        state, _ = iterate(state, bank, machine, nothing)
+    jax.block_until_ready(state)
+    print(time.perf_counter() - before, flush=True)
+"""
+# Run with each checkout's own modules; so it may use only what all of them have.
+
+
+@dataclasses.dataclass(frozen=True)
+class Flags:
+    """What to compare."""
+
+    contestants: tyro.conf.Positional[tuple[str, ...]]
+    """NAME=CHECKOUT:DEVICES, the first is what the others are compared to; with ',{"config.blocks": 4}' at its end
+    (JSON) some settings of this one are others."""
+    env: str = "letter"
+    recipe: Recipe = "hrlspec"
+    warmup: int = 60
+    """Iterations before the first turn: episodes of an untrained agent are longer."""
+    turns: int = 9
+    iterations: int = 2
+    """In a turn."""
+    out: Path | None = None
+    """Where the JSON goes besides standard output."""
+
+
+class Contestant:
+    """A process that trains when it is told to."""
+
+    def __init__(self, text: str, env: str, recipe: str) -> None:
+        text, _, changes = text.partition(",")
+        self.name, _, where = text.partition("=")
+        checkout, _, devices = where.rpartition(":")
+        root = Path(checkout).resolve()
+        self.what = {"commit": _commit(root), "devices": int(devices), **({"changes": changes} if changes else {})}
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", _CONTESTANT, env, recipe, devices, changes or "{}"],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=root,
+            env=os.environ | {"PYTHONPATH": str(root)},
+        )  # fmt: skip
+        steps, first, self.jax = self._answer().split()
+        self.steps, self.first_iteration_s = int(steps), float(first)
+
+    def train(self, iterations: int) -> float:
+        """Steps/s of so many iterations."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{iterations}\n")
+        self._process.stdin.flush()
+        return iterations * self.steps / float(self._answer())
+
+    def _answer(self) -> str:
+        assert self._process.stdout is not None
+        answer = self._process.stdout.readline()
+        if not answer:
+            raise SystemExit(f"{self.name} ended with status {self._process.wait()}")
+        return answer
+
+
+def _commit(root: Path) -> str:
+    """The commit of a checkout, and whether it was changed."""
+    git = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=7", "--exclude=*"]
+    return subprocess.run(git, check=True, capture_output=True, text=True).stdout.strip()
+
+
+def _spread(values: list[float], digits: int) -> Mapping[str, float]:
+    """Median, least and most."""
+    return {of.__name__: round(of(values), digits) for of in (statistics.median, min, max)}
+
+
+def compare(flags: Flags) -> Mapping[str, Any]:
+    """Medians over the turns, and of their ratios to the first contestant's."""
+    contestants = [Contestant(text, flags.env, flags.recipe) for text in flags.contestants]
+    for one in contestants:
+        one.train(flags.warmup)
+    turns = [[one.train(flags.iterations) for one in contestants] for _ in range(flags.turns)]
+    report: dict[str, Any] = {"env": flags.env, "recipe": flags.recipe, "jax": contestants[0].jax}
+    for i, one in enumerate(contestants):
+        rates, ratios = [turn[i] for turn in turns], [turn[i] / turn[0] for turn in turns]
+        report[f"{one.name}, {one.what['devices']} devices"] = {
+            **one.what,
+            "first_iteration_s": round(one.first_iteration_s, 1),
+            "steps_per_s": _spread(rates, 0),
+            "ratio": _spread(ratios, 3),
+        }
+    return report
+
+
+def main() -> None:
+    """Compares and prints."""
+    flags = tyro.cli(Flags, description=__doc__)
+    text = json.dumps(compare(flags), indent=2)
+    print(text)
+    if flags.out:
+        flags.out.write_text(text + "\n")
+
+
+if __name__ == "__main__":
+    main()
