@@ -23,10 +23,11 @@ import numpy as np
 
 import envs_jax
 from hrlspec.agent.agent import Agent
-from hrlspec.config import evolve
+from hrlspec.config import ConfigError, evolve
 from hrlspec.learning.rollout import Setting, collect, fill_pool
 from hrlspec.learning.train import Trainer
 from hrlspec.presets import Recipe, preset
+from hrlspec.run.errors import UserError
 from hrlspec.run.platform import prepare
 from hrlspec.run.programs import Program
 from hrlspec.tasks.bank import TaskBanks
@@ -113,14 +114,26 @@ def environment(
     return rate(roll, (jax.random.key(1), state, observation), num_envs * num_steps, seconds)
 
 
-def learner(name: str, recipe: Recipe, devices: int) -> tuple[Trainer, Any, Any]:
-    """The paper's method with a recipe's settings, a bank of training tasks, and the rewards of set 1."""
+def trainer_of(name: str, recipe: Recipe, devices: int) -> Trainer:
+    """The paper's method with a recipe's settings, on so many devices in as many blocks.
+
+    Raises:
+        UserError: the devices do not share the environments evenly, or there are not as many.
+    """
     some = preset(name)
     config, method = some.settings("ours", recipe)
-    trainer = Trainer(Agent(some.make(), evolve(config, {"blocks": devices}), method), devices)
+    try:
+        return Trainer(Agent(some.make(), evolve(config, {"blocks": devices}), method), devices)
+    except ConfigError as error:
+        raise UserError(f"--devices {devices}: {error}") from error
+
+
+def learner(name: str, recipe: Recipe, devices: int) -> tuple[Trainer, Any, Any]:
+    """The paper's method, a bank of training tasks, and the rewards of set 1."""
+    trainer = trainer_of(name, recipe, devices)
     nothing = np.zeros(0, np.uint32)
     banks = TaskBanks(0, trainer.agent.config.curriculum, trainer.agent.env.num_propositions, nothing)
-    return trainer, banks.at(0), some.rewards()
+    return trainer, banks.at(0), preset(name).rewards()
 
 
 def programs(name: str, recipe: Recipe, trainer: Trainer) -> tuple[Program, Program]:
@@ -197,6 +210,8 @@ def main(script: str, env: str, flags: CommonFlags, measure: Callable[[], Mappin
         measure: the entries about the environment alone.
     """
     prepare(host_devices=flags.devices)
+    for recipe in flags.recipes:
+        trainer_of(env, recipe, flags.devices)  # what cannot be is refused before anything is measured
     if flags.only_start:
         print(json.dumps(start(env, flags.recipes[0], flags.devices)))
         return

@@ -6,11 +6,13 @@ python -m benchmarks.letter [--env letter12] [--recipes paper hrlspec] [--second
 from __future__ import annotations
 
 import dataclasses
+import sys
 from typing import Literal
 
 import tyro
 
 from benchmarks import common
+from hrlspec.run.errors import main_guard
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,4 +34,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main_guard(main))

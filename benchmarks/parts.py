@@ -12,6 +12,7 @@ import dataclasses
 import functools
 import json
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -31,6 +32,7 @@ from hrlspec.learning.ppo import low_level_loss
 from hrlspec.learning.reach import reach_batch, reach_loss
 from hrlspec.learning.rollout import Setting, collect, fill_pool
 from hrlspec.presets import Recipe, preset
+from hrlspec.run.errors import main_guard
 from hrlspec.run.platform import compiler_options, prepare
 
 
@@ -168,4 +170,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main_guard(main))

@@ -40,6 +40,7 @@ from hrlspec.config import evolve
 from hrlspec.learning.train import Trainer
 from hrlspec.methods import METHODS, ImplicitPlanner
 from hrlspec.presets import RECIPES, Preset, Recipe, RewardSet, preset
+from hrlspec.run.errors import main_guard
 from hrlspec.tasks.curriculum import draw_bank
 
 RECORD = Path(__file__).with_suffix(".json")
@@ -128,4 +129,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main_guard(main))

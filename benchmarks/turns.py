@@ -21,6 +21,7 @@ from typing import Any
 import tyro
 
 from hrlspec.presets import Recipe
+from hrlspec.run.errors import UserError, main_guard
 
 _CONTESTANT = """
 import importlib.metadata, json, sys, time
@@ -74,6 +75,8 @@ class Contestant:
         self.name, _, where = text.partition("=")
         checkout, _, devices = where.rpartition(":")
         root = Path(checkout).resolve()
+        if not devices.isdigit() or not (root / "benchmarks" / "common.py").is_file():
+            raise UserError(f"contestant {text!r}: expected NAME=CHECKOUT:DEVICES, with a checkout of this project")
         self.what = {"commit": _commit(root), "devices": int(devices), **({"changes": changes} if changes else {})}
         self._process = subprocess.Popen(
             [sys.executable, "-c", _CONTESTANT, env, recipe, devices, changes or "{}"],
@@ -94,7 +97,7 @@ class Contestant:
         assert self._process.stdout is not None
         answer = self._process.stdout.readline()
         if not answer:
-            raise SystemExit(f"{self.name} ended with status {self._process.wait()}")
+            raise UserError(f"contestant {self.name} ended with status {self._process.wait()}, see above")
         return answer
 
 
@@ -137,4 +140,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main_guard(main))

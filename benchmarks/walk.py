@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import statistics
+import sys
 import time
 from typing import Any, Literal
 
@@ -17,6 +18,7 @@ import tyro
 import envs_jax
 from benchmarks import common
 from hrlspec.exact.shortest_path import planned_steps
+from hrlspec.run.errors import main_guard
 from hrlspec.tasks.sampling import sample_trees
 
 
@@ -68,4 +70,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main_guard(main))

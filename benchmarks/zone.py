@@ -9,6 +9,7 @@ import dataclasses
 import functools
 import importlib.metadata
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from typing import Any, Literal
@@ -21,6 +22,7 @@ import tyro
 import envs_jax
 from benchmarks import common
 from envs_jax.zone import physics as zone_physics
+from hrlspec.run.errors import main_guard
 
 STEPS_A_CALL = 51_200
 """Environment steps in one call, over all environments, within the limits of `_num_steps`."""
@@ -207,4 +209,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main_guard(main))

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from hrlspec.agent.networks.messages import Rounds, Sweep, below
+from hrlspec.agent.networks.planner import Planner, PlannerConfig
 from hrlspec.agent.networks.transition import Transition
-from hrlspec.spec import TaskState, TaskTree, initial, subtask_avoid
+from hrlspec.config import NetworkConfig
+from hrlspec.spec import TaskState, TaskTree, initial, open_edges, subtask_avoid
 from tests.probes import on_device, quick_jit
 from tests.trees import random_tree
 
@@ -136,8 +138,33 @@ def test_messages_and_updates(module: Any, read: Any) -> None:
         check(np.asarray(embed(x[which], on_device(cases[which][0]), cases[which][1])), which)
     size = 6
     most, fewest = np.argsort(-remaining)[:size], np.argsort(remaining)[:size]
-    assert remaining[most].sum() > N * size // 2 >= remaining[fewest].sum()
+    assert remaining[most].sum() > 3 * N * size // 8 >= remaining[fewest].sum()
     for rows in (most, fewest):
         trees, at = jax.tree.map(lambda *leaf: jnp.stack(leaf), *(cases[i] for i in rows))
         for found, which in zip(np.asarray(batched(x[rows], trees, at)), rows, strict=True):
             check(found, which)
+
+
+@pytest.mark.parametrize("advice", [0.0, 2.0])
+def test_many_trees_are_planned_as_each_alone(advice: float) -> None:
+    """Where few edges are open, and where so many are that all are computed."""
+    sizes = PlannerConfig(features=F, hidden=HIDDEN, policy=(5, 4), rounds=ROUNDS, advice=advice)
+    planner = Planner(sizes, NetworkConfig(latent=LATENT, encoder_mlp=(6,)))
+    cases = [(tree, state) for tree in some_trees(8) for state in states(tree)]
+    rng = np.random.default_rng(1)
+    views = [tuple(rng.normal(size=shape).astype(np.float32) for shape in ((P, 3), (2,))) for _ in cases]
+    advices = rng.normal(size=(len(cases), N)).astype(np.float32)
+    params = parameters(planner, views[0], on_device(cases[0][0]), cases[0][1], advices[0])
+    num_open = np.array([int(open_edges(on_device(tree), state).sum()) for tree, state in cases])
+    alone = quick_jit(lambda *args: planner.apply(params, *args))
+    together = quick_jit(jax.vmap(lambda *args: planner.apply(params, *args)))
+    size = 4
+    most, fewest = np.argsort(-num_open)[:size], np.argsort(num_open)[:size]
+    assert num_open[most].sum() > N * size // 4 >= num_open[fewest].sum()
+    for rows in (most, fewest):
+        inputs = [(views[i], *cases[i], advices[i]) for i in rows]
+        logits, value = map(np.asarray, together(*jax.tree.map(lambda *leaf: jnp.stack(leaf), *inputs)))
+        for i, one in enumerate(inputs):
+            expected = alone(one[0], on_device(one[1]), *one[2:])
+            np.testing.assert_allclose(logits[i], expected[0], rtol=2e-3, atol=2e-3)
+            np.testing.assert_allclose(value[i], expected[1], rtol=2e-3, atol=2e-3)
