@@ -11,9 +11,12 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Int32
+from jaxtyping import Bool, Int32, Shaped
 
 from envs_jax.arrays import Array
+
+AT_ONCE = 4096
+"""Environments that an accelerator computes at a time at least."""
 
 Inputs = TypeVar("Inputs")
 Outputs = TypeVar("Outputs")
@@ -32,13 +35,24 @@ def take(tree: Inputs, *index: Any) -> Inputs:
     return taken
 
 
+def where(condition: Bool[Array, " E"], new: Inputs, old: Inputs) -> Inputs:
+    """Leaves of ``new`` in the environments where ``condition`` (bool ``[E]``), of ``old`` in the others."""
+
+    def pick(new: Shaped[Array, "E ..."], old: Shaped[Array, "E ..."]) -> Array:
+        return jnp.where(condition.reshape(condition.shape + (1,) * (new.ndim - 1)), new, old)
+
+    picked: Inputs = jax.tree.map(pick, new, old)
+    return picked
+
+
 def in_groups(
     function: Callable[[Inputs], Outputs], needed: Bool[Array, " E"], inputs: Inputs, outputs: Outputs, group: int
 ) -> Outputs:
     """Computes ``function`` where it is needed, ``group`` environments at a time.
 
     A vmapped ``cond`` would compute it for all of them at every step. Instead the waiting ones are gathered
-    in groups of fixed size, computed, and scattered back, until none waits.
+    in groups of fixed size, computed, and scattered back, until none waits. An accelerator, which small groups would
+    leave idle and loops would stop for, computes all of them, or `AT_ONCE` at a time.
 
     Args:
         function: maps gathered inputs (leading axis ``group``) to outputs of the same leading axis.
@@ -48,6 +62,10 @@ def in_groups(
         group: how many at a time.
     """
     num_envs = needed.shape[0]
+    if jax.default_backend() != "cpu":
+        group = max(group, AT_ONCE)
+        if group >= num_envs:
+            return where(needed, function(inputs), outputs)
     group = min(group, num_envs)
 
     def body(carry: tuple[Bool[Array, " E"], Outputs]) -> tuple[Bool[Array, " E"], Outputs]:

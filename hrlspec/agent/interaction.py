@@ -7,12 +7,11 @@ atomic propositions, **K** candidate actions, **R** bonus rules.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Bool, Float32, Int, Int32, Key, Shaped
+from jaxtyping import Bool, Float32, Int, Int32, Key
 
 from envs_jax import Environment
 from envs_jax.arrays import Array
@@ -204,15 +203,6 @@ def transition(
         rules=rules,
     )
     return after, outcome
-
-
-def where(condition: Bool[Array, " E"], new: Any, old: Any) -> Any:
-    """Leaves of ``new`` in the environments where ``condition`` (bool ``[E]``), of ``old`` in the others."""
-
-    def pick(new: Shaped[Array, "E ..."], old: Shaped[Array, "E ..."]) -> Shaped[Array, "E ..."]:
-        return jnp.where(condition.reshape(condition.shape + (1,) * (new.ndim - 1)), new, old)
-
-    return jax.tree.map(pick, new, old)
 
 
 def _views(env: Environment, observation: Float32[Array, "E ..."]) -> View:

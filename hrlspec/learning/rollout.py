@@ -20,9 +20,9 @@ from envs_jax.arrays import Array
 from envs_jax.base import Layout
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.experience import Bootstrap, HighDecision, LowDecision, Step, View, flat
-from hrlspec.agent.groups import in_groups, one_by_one, take
+from hrlspec.agent.groups import in_groups, one_by_one, take, where
 from hrlspec.agent.high_level import Judgement
-from hrlspec.agent.interaction import Worker, act, decide, start, task_of, transition, where
+from hrlspec.agent.interaction import Worker, act, decide, start, task_of, transition
 from hrlspec.agent.low_level import Params, TaskBook
 from hrlspec.spec import TaskState, TaskTree
 from hrlspec.tasks import curriculum

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from hrlspec.agent import groups
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.distributions import Categorical
 from hrlspec.agent.experience import View
@@ -23,16 +24,23 @@ from tests.trees import random_tree
 P, A = 5, 4
 
 
-@pytest.mark.parametrize("group", [1, 3, 8, 50])
+@pytest.mark.parametrize(
+    ("backend", "group", "at_a_time"),
+    [("cpu", 1, 1), ("cpu", 3, 3), ("cpu", 8, 8), ("cpu", 50, 20), ("an accelerator", 3, 7), ("with room", 3, 20)],
+)
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
-def test_groups_compute_for_those_in_need_and_keep_the_rest(group: int, share: float) -> None:
+def test_groups_compute_for_those_in_need_and_keep_the_rest(
+    backend: str, group: int, at_a_time: int, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    monkeypatch.setattr(groups, "AT_ONCE", 20 if backend == "with room" else 7)
     rng = np.random.default_rng(group)
     needed = rng.random(20) < share
     inputs = {"x": rng.normal(size=(20, 3)).astype(np.float32), "i": np.arange(20)}
     kept = on_device((-np.ones(20, np.float32), -np.ones((20, 2), np.int32)))
 
     def function(x: Any) -> Any:
-        assert x["x"].shape == (min(group, 20), 3)
+        assert x["x"].shape == (at_a_time, 3)
         return x["x"].sum(-1), jnp.stack([x["i"], 2 * x["i"]], -1)
 
     sums, pairs_ = in_groups(function, jnp.asarray(needed), on_device(inputs), kept, group)
