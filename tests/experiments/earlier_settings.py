@@ -71,6 +71,9 @@ BEFORE = {
     "config.blocks": (1,),
     "config.group": (8, 32),
     "config.low.optimiser.epochs": (2,),
+    "config.low.optimiser.minibatches": (16,),
+    "config.low.value_coefficient": (0.5,),
+    f"{_PLANNER}.steps_per_sample": (64,),
 }
 """What has been changed for speed since the records were made, and what they say of it. The page of results tells."""
 
