@@ -326,7 +326,8 @@ def test_decisions_log_probabilities_and_values(book: TaskBook, t: Step) -> None
     np.testing.assert_allclose(t.high.log_prob.ravel()[made], expected, atol=1e-5)
     # Where one way is left to the end, V^h is what the low level expects of it.
     nodes, lost = t.state.node.ravel(), t.state.blocked.reshape(T * E, -1)
-    one_way = np.array([ways(tree_of_row(book, task), *at) == 1 for task, *at in zip(t.task.ravel(), nodes, lost)])
+    at = zip(t.task.ravel(), nodes, lost, strict=True)
+    one_way = np.array([ways(tree_of_row(book, task), node, gone) == 1 for task, node, gone in at])
     worth = np.where(one_way, t.low.value.ravel(), np.asarray(value))
     np.testing.assert_allclose(t.high.value.ravel()[made], worth[made], atol=1e-5)
     assert 10 < (made & one_way).sum() < made.sum() - 10
