@@ -307,6 +307,14 @@ def evolve(settings: S, changes: Mapping[str, Any]) -> S:
     return dataclasses.replace(settings, **values)  # type: ignore[type-var]
 
 
+def without_copies(config: Config) -> Config:
+    """No relabelled copies; minibatches as large as with them, if the environments divide into such."""
+    rows, minibatches = config.envs_per_block + config.copies_per_block, config.low.optimiser.minibatches
+    fewer, rest = divmod(minibatches * config.envs_per_block, rows)
+    kept = minibatches if rest or config.envs_per_block % fewer else fewer
+    return evolve(config, {"relabel.share": 0.0, "low.optimiser.minibatches": kept})
+
+
 def check_divides(name: str, optimiser: OptimiserConfig, rows: int, what: str) -> None:
     """Refuses minibatches that do not share their rows evenly.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import ClassVar
 
-from hrlspec.config import Config, evolve
+from hrlspec.config import Config, without_copies
 from hrlspec.methods.ours import Ours
 
 
@@ -17,11 +17,8 @@ class NoER(Ours):
     about: ClassVar[str] = "ours without relabelled experience"
 
     def configure(self, config: Config) -> Config:
-        """No relabelled copies; minibatches as large as with them, if the environments divide into such."""
-        rows, minibatches = config.envs_per_block + config.copies_per_block, config.low.optimiser.minibatches
-        fewer, rest = divmod(minibatches * config.envs_per_block, rows)
-        kept = minibatches if rest or config.envs_per_block % fewer else fewer
-        return evolve(config, {"relabel.share": 0.0, "low.optimiser.minibatches": kept})
+        """See `without_copies`."""
+        return without_copies(config)
 
 
 NO_ER = NoER()

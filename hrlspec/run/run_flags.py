@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
-from hrlspec.config import Checked, Config, ConfigError, evolve, setting
+from hrlspec.config import Checked, Config, ConfigError, evolve, setting, without_copies
 from hrlspec.methods import METHODS, OURS, Method
 from hrlspec.presets import PRESETS, Recipe, RewardSet
 from hrlspec.run.errors import UserError
@@ -182,8 +182,6 @@ def _switched(flags: RunFlags) -> tuple[Config, Method]:
         changes["total_steps"] = flags.total_steps
     if flags.no_shield:
         changes["shield.enabled"] = False
-    if flags.no_relabel:
-        changes["relabel.share"] = 0.0
     if flags.no_curriculum:
         # Every verdict promotes, and "a level already passed" has the share of all levels but one.
         levels = flags.config.curriculum.levels
@@ -193,7 +191,8 @@ def _switched(flags: RunFlags) -> tuple[Config, Method]:
         method = _without(method, "max-operator", {"max_operator": False})
     if flags.no_transe:
         method = _without(method, "transe", {"transe": 0.0})
-    return evolve(flags.config, changes), method
+    config = evolve(flags.config, changes)
+    return without_copies(config) if flags.no_relabel else config, method
 
 
 def _without(method: Method, technique: str, changes: Mapping[str, Any]) -> Method:
