@@ -6,7 +6,7 @@ import functools
 
 import envs_jax
 from hrlspec.presets.preset import Preset
-from hrlspec.presets.recipes import Recipe, Settings
+from hrlspec.presets.recipes import Recipe, Settings, once, twice
 from hrlspec.presets.suite_rules import (
     DAG,
     NUM_TASKS,
@@ -30,28 +30,14 @@ _LEARNING_RATES: dict[tuple[Recipe, str], float] = {
 }
 
 
-_TWICE = {"config.low.optimiser.epochs": 2, "config.low.optimiser.minibatches": 16}
-
-
 def letter(settings: Settings, recipe: Recipe) -> Settings:
     """A recipe as it is, but for how the low level learns."""
-    if recipe == "paper":
-        return settings
-    return settings.evolve(
-        {
-            # Returns are 1 at most, and the critic's squared error a hundredth of that: weighed less, the encoder that
-            # it shares learns for the policy. The critic's values choose the way.
-            "config.low.value_coefficient": 4.0,
-            # So it needs to go through the steps only once.
-            "config.low.optimiser.epochs": 1,
-            "config.low.optimiser.minibatches": 40,
-        }
-    )
+    return settings if recipe == "paper" else once(settings, minibatches=40)
 
 
 def letter_with_bonuses(settings: Settings, recipe: Recipe) -> Settings:
-    """Reward set 2, whose returns are ten times as large, and the critic's squared errors a hundred times."""
-    return settings if recipe == "paper" else settings.evolve(_TWICE | {"config.low.value_coefficient": 0.5})
+    """Reward set 2."""
+    return settings if recipe == "paper" else twice(settings)
 
 
 def _twelve(settings: Settings, recipe: Recipe) -> Settings:

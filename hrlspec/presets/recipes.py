@@ -57,6 +57,32 @@ def with_bonuses(settings: Settings, name: Recipe) -> Settings:
     )
 
 
+def once(settings: Settings, minibatches: int) -> Settings:
+    """The low level goes through its steps once, under reward set 1, whose returns are 1 at most.
+
+    The critic's squared errors are then a hundredth: weighed less, the encoder that it shares with the actor learns for
+    the actor. Its values choose the way, and with half as many passes the choice would suffer.
+    """
+    return settings.evolve(
+        {
+            "config.low.optimiser.epochs": 1,
+            "config.low.optimiser.minibatches": minibatches,
+            "config.low.value_coefficient": 4.0,
+        }
+    )
+
+
+def twice(settings: Settings) -> Settings:
+    """Undoes `once`: under reward set 2 returns are ten times as large, and squared errors a hundred times."""
+    return settings.evolve(
+        {
+            "config.low.optimiser.epochs": 2,
+            "config.low.optimiser.minibatches": 16,
+            "config.low.value_coefficient": 0.5,
+        }
+    )
+
+
 def continuous(settings: Settings, learning_rate: float) -> Settings:
     """What worlds of small steps and Gaussian actions share: long rollouts, few decisions, coloured noise.
 
