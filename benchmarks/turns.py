@@ -23,8 +23,9 @@ import tyro
 from hrlspec.presets import Recipe
 from hrlspec.run.errors import UserError, main_guard
 
+# Run with each checkout's own modules; so it may use only what all of them have.
 _CONTESTANT = """
-import importlib.metadata, json, sys, time
+import json, sys, time
 name, recipe, devices, changes = sys.argv[1], sys.argv[2], int(sys.argv[3]), json.loads(sys.argv[4])
 from hrlspec.run.platform import prepare
 prepare(host_devices=devices)
@@ -46,7 +47,6 @@ for line in sys.stdin:
     jax.block_until_ready(state)
     print(time.perf_counter() - before, flush=True)
 """
-# Run with each checkout's own modules; so it may use only what all of them have.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +104,10 @@ class Contestant:
 def _commit(root: Path) -> str:
     """The commit of a checkout, and whether it was changed."""
     git = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=7", "--exclude=*"]
-    return subprocess.run(git, check=True, capture_output=True, text=True).stdout.strip()
+    answer = subprocess.run(git, check=False, capture_output=True, text=True)
+    if answer.returncode:
+        raise UserError(f"{root} is no checkout: {answer.stderr}")
+    return answer.stdout.strip()
 
 
 def _spread(values: list[float], digits: int) -> Mapping[str, float]:

@@ -58,10 +58,10 @@ def with_bonuses(settings: Settings, name: Recipe) -> Settings:
 
 
 def once(settings: Settings, minibatches: int) -> Settings:
-    """The low level goes through its steps once, under reward set 1, whose returns are 1 at most.
+    """The low level goes through its steps once, for reward set 1, whose returns are 1 at most.
 
-    The critic's squared errors are then a hundredth: weighed less, the encoder that it shares with the actor learns for
-    the actor. Its values choose the way, and with half as many passes the choice would suffer.
+    The critic's squared errors are a hundredth or less then. Its values choose the way: without the larger weight the
+    choice suffers from half as many passes.
     """
     return settings.evolve(
         {
@@ -73,7 +73,7 @@ def once(settings: Settings, minibatches: int) -> Settings:
 
 
 def twice(settings: Settings) -> Settings:
-    """Undoes `once`: under reward set 2 returns are ten times as large, and squared errors a hundred times."""
+    """Undoes `once` under reward set 2, whose returns, and with them the critic's errors, are larger."""
     return settings.evolve(
         {
             "config.low.optimiser.epochs": 2,

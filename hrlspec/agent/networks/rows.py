@@ -24,7 +24,7 @@ def where_needed(
         function: ``(rows, place)``, rows in and out; ``place`` says where each of the R went, int32 ``[R]``.
         needed: bool ``[R]``. What comes out for the others is meaningless, but finite.
         rows: pytree, leading axis R.
-        most: how many are computed at least.
+        most: how many rows the smaller of both programs computes.
     """
     num_rows = needed.shape[0]
 
