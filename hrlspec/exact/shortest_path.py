@@ -92,10 +92,29 @@ def shortest_steps(grid: Grid, tree: TaskTree) -> Float32[np.ndarray, " L"]:
     Returns:
         float32 ``[L]``.
     """
+    return _from_start(grid, tree, slice(1))[:, 0]
+
+
+def branch_steps(grid: Grid, tree: TaskTree) -> Float32[np.ndarray, "L C"]:
+    """The same for each branch: only the first edge to that child of the root may be taken.
+
+    Args:
+        grid: L layouts.
+        tree: one task (unbatched).
+
+    Returns:
+        float32 ``[L, C]``, in the order of :func:`hrlspec.exact.solver.root_children`. The minimum over branches is the
+        optimum.
+    """
+    return _from_start(grid, tree, slice(1, None))
+
+
+def _from_start(grid: Grid, tree: TaskTree, which: slice) -> Float32[np.ndarray, "L _"]:
+    """Least steps from the start for some of the automaton's initial states."""
     machine = automaton(tree, grid.symbols)
-    first = machine.initial[0]
-    steps = _steps_tables(grid, machine)[first]
-    return steps[(np.arange(grid.num_layouts), *grid.start.T)]
+    states = machine.initial[which].tolist()
+    tables = _steps_tables(grid, machine, states)
+    return np.stack([tables[state][(np.arange(grid.num_layouts), *grid.start.T)] for state in states], -1)
 
 
 def nearest_first_steps(grid: Grid, tree: TaskTree) -> Float32[np.ndarray, " L"]:
@@ -147,8 +166,8 @@ def _nearest_first(one: Grid, tree: TaskTree, machine: Automaton) -> float:
     return float(steps)
 
 
-def _steps_tables(grid: Grid, machine: Automaton) -> dict[int, Float32[np.ndarray, "L X Y"]]:
-    """Least further steps to satisfaction from each place, float32 ``[L, X, Y]``, for each running automaton state.
+def _steps_tables(grid: Grid, machine: Automaton, starts: list[int]) -> dict[int, Float32[np.ndarray, "L X Y"]]:
+    """Least further steps to satisfaction from each place, float32 ``[L, X, Y]``, for each running automaton state reachable from ``starts``.
 
     The automaton never returns to a state that it left, so states are solved in reverse topological order: the steps
     after leaving a state are known, and within the state only distance matters.
@@ -159,7 +178,7 @@ def _steps_tables(grid: Grid, machine: Automaton) -> dict[int, Float32[np.ndarra
         Automaton.SATISFIED: np.zeros(shape, np.float32),
         Automaton.VIOLATED: np.full(shape, np.inf, np.float32),
     }
-    for state in _successors_first(machine):
+    for state in _successors_first(machine, starts):
         leaving = np.full(shape, np.inf, np.float32)
         left = ~grid.inside
         for symbol, successors in enumerate(machine.successor[:, state]):
@@ -174,8 +193,8 @@ def _steps_tables(grid: Grid, machine: Automaton) -> dict[int, Float32[np.ndarra
     return tables
 
 
-def _successors_first(machine: Automaton) -> Iterator[int]:
-    """The running states reachable from the initial one, in reverse topological order."""
+def _successors_first(machine: Automaton, starts: list[int]) -> Iterator[int]:
+    """The running states reachable from some, in reverse topological order."""
     seen: set[int] = {Automaton.SATISFIED, Automaton.VIOLATED}
 
     def visit(state: int) -> Iterator[int]:
@@ -185,7 +204,9 @@ def _successors_first(machine: Automaton) -> Iterator[int]:
                 yield from visit(after)
         yield state
 
-    yield from visit(int(machine.initial[0]))
+    for start in starts:
+        if start not in seen:
+            yield from visit(start)
 
 
 def _path_lengths(

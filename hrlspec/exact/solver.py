@@ -72,6 +72,19 @@ def optimal_steps(graph: Graph, tree: TaskTree) -> Float32[np.ndarray, " L"]:
     return _from_start(graph, tree, None, steps_table)[:, 0]
 
 
+def branch_steps(graph: Graph, tree: TaskTree) -> Float32[np.ndarray, "L C"]:
+    """The same for each branch: only the first edge to that child of the root may be taken.
+
+    Args:
+        graph: L layouts.
+        tree: one task (unbatched).
+
+    Returns:
+        float32 ``[L, C]``, in the order of :func:`root_children`. The minimum over branches is the optimum.
+    """
+    return _from_start(graph, tree, None, steps_table)[:, 1:]
+
+
 def branch_returns(
     graph: Graph, tree: TaskTree, rewards: RewardMachine | None, horizon: int
 ) -> Float32[np.ndarray, "L C"]:

@@ -19,6 +19,7 @@ from hrlspec.exact.shortest_path import (
     Grid,
     _neighbours,
     _steps_tables,
+    branch_steps,
     grid_of,
     nearest_first_steps,
     planned_steps,
@@ -94,7 +95,7 @@ class Path:
 def _shortest_path(grid: Grid, tree: TaskTree, layout: int) -> Path:
     """A path down the tables of least steps; of several, the one through the neighbours of lowest index."""
     one, machine = grid[layout : layout + 1], automaton(tree, grid.symbols)
-    tables = {state: table[0] for state, table in _steps_tables(one, machine).items()}
+    tables = {state: table[0] for state, table in _steps_tables(one, machine, machine.initial[:1].tolist()).items()}
     place, state = (int(one.start[0, 0]), int(one.start[0, 1])), int(machine.initial[0])
     places, edges = [place], []
     while state != Automaton.SATISFIED:
@@ -120,6 +121,7 @@ def test_least_steps_are_the_exact_solvers() -> None:
         grid = _random_grid(rng, 4, 9, 7)
         expected = solver.optimal_steps(_as_graph(grid), tree)
         np.testing.assert_array_equal(shortest_steps(grid, tree), expected)
+        np.testing.assert_array_equal(branch_steps(grid, tree), solver.branch_steps(_as_graph(grid), tree))
         finite += int(np.isfinite(expected).sum())
     assert 20 < finite < 100
 

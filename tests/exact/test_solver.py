@@ -149,13 +149,15 @@ def _assert_matches_brute_force(
 ) -> None:
     num_actions = graph.successors.shape[-1]
     steps, returns = solver.optimal_steps(graph, tree), solver.branch_returns(graph, tree, machine, horizon)
+    by_branch = solver.branch_steps(graph, tree)
     brute = functools.partial(brute_force, tree=tree, machine=machine, num_actions=num_actions, horizon=horizon)
     for i, where in enumerate(wheres):
         expected = brute(world, where, start=int(graph.start[i]))
         assert (steps[i] if steps[i] <= horizon else np.inf, returns[i].max()) == pytest.approx(expected)
         for c, child in enumerate(solver.root_children(tree)):
-            _, expected_return = brute(world, where, start=int(graph.start[i]), first=int(child))
-            assert returns[i, c] == pytest.approx(expected_return)
+            expected = brute(world, where, start=int(graph.start[i]), first=int(child))
+            within = by_branch[i, c] if by_branch[i, c] <= horizon else np.inf
+            assert (within, returns[i, c]) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("seed", range(4))
