@@ -167,10 +167,11 @@ def _nearest_first(one: Grid, tree: TaskTree, machine: Automaton) -> float:
 
 
 def _steps_tables(grid: Grid, machine: Automaton, starts: list[int]) -> dict[int, Float32[np.ndarray, "L X Y"]]:
-    """Least further steps to satisfaction from each place, float32 ``[L, X, Y]``, for each running automaton state reachable from ``starts``.
+    """Least further steps to satisfaction from each place, float32 ``[L, X, Y]``, by running automaton state.
 
-    The automaton never returns to a state that it left, so states are solved in reverse topological order: the steps
-    after leaving a state are known, and within the state only distance matters.
+    Those states that are reachable from ``starts``. The automaton never returns to a state that it left, so states are
+    solved in reverse topological order: the steps after leaving a state are known, and within the state only distance
+    matters.
     """
     tables: dict[int, np.ndarray] = {}
     shape = grid.symbol.shape
