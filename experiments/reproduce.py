@@ -16,6 +16,7 @@ from experiments.paper.making import command, make
 from experiments.paper.panels import (
     NUM_SEEDS,
     PANELS,
+    RECIPES,
     TRAJECTORIES,
     TRAJECTORY_TASKS,
     TUNING,
@@ -24,7 +25,6 @@ from experiments.paper.panels import (
     trajectory_run,
 )
 from experiments.paper.records import read_records, record_of
-from hrlspec.presets import RECIPES
 from hrlspec.run.cli import call
 from hrlspec.run.console import PlainConsole
 from hrlspec.run.errors import UserError

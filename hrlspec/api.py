@@ -70,7 +70,8 @@ def train(
         env: the name of a preset, or any environment; its settings are then chosen by its spaces.
         total_steps: environment steps for each agent; the preset's if not given.
         method: one of `hrlspec.methods.METHODS` by name, or a value of a `hrlspec.methods.Method`.
-        recipe: ``paper``, the paper's method, or ``hrlspec``, what measured better.
+        recipe: ``paper``, the paper's method; ``planner``, the same, but that the planner is asked about every path; or
+            ``hrlspec``, what measured better.
         reward_set: 1, for completing the task, or 2, also for sub-tasks and for some orders of them.
         changes: shared settings to change, by dotted names such as ``{"low.optimiser.learning_rate": 1e-3}``.
         held_out: tasks that must not be trained on, besides the preset's test suites.

@@ -42,6 +42,12 @@ def probe_task(name: str, *, num_propositions: int, num_nodes: int) -> TaskTree:
         "b or a": [(0, "b", ""), (0, "a", "")],
         "(a or b); c": [(0, "a", ""), (0, "b", ""), (1, "c", ""), (2, "c", "")],
         "a ensuring not b": [(0, "a", "b")],
+        "achieve b": [(0, "b", "")],
+        "b ensuring not a": [(0, "b", "a")],
+        "(achieve a); c": [(0, "a", ""), (1, "c", "")],
+        "(achieve b); c": [(0, "b", ""), (1, "c", "")],
+        "(a ensuring not b); c": [(0, "a", "b"), (1, "c", "")],
+        "(b ensuring not a); c": [(0, "b", "a"), (1, "c", "")],
     }[name]
     return tree_of(edges, num_propositions=num_propositions, num_nodes=num_nodes)
 

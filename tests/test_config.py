@@ -98,6 +98,7 @@ BOUNDS: dict[type, dict[str, tuple[float, float]]] = {
         "transe": (0, 1e6),
         "transe_margin": (0, 1e6),
         "advised": (1, INF),
+        "inverse_temperature": (0, 1e6),
     },
     LogicValueIteration: {"sharpness": (0, 1e6), "decay": (0, 1)},
 }

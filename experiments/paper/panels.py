@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from hrlspec.presets import RECIPES, Recipe, RewardSet
+from hrlspec.presets import Recipe, RewardSet
 
+RECIPES: tuple[Recipe, ...] = ("paper", "hrlspec")
 ENVIRONMENTS = ("letter", "walk", "zone")
 BUDGETS = {"letter": 1_500_000, "walk": 2_000_000, "zone": 4_000_000}
 """Environment steps of a run."""

@@ -20,10 +20,9 @@ from experiments.paper.claims import (
     over_seeds,
     steps_to_most,
 )
-from experiments.paper.panels import PANELS, TRAJECTORIES, TUNING, Curve, Panel, Run
+from experiments.paper.panels import PANELS, RECIPES, TRAJECTORIES, TUNING, Curve, Panel, Run
 from experiments.paper.records import Record
 from hrlspec.evaluation.stats import interquartile_mean, mean_interval
-from hrlspec.presets import RECIPES
 from hrlspec.run.progress import duration
 
 _ABOUT = """\

@@ -36,6 +36,7 @@ class HighDecision:
     log_prob: Float32[Array, "*lead"]
     value: Float32[Array, "*lead"]  # V^h of the remaining task
     advice: Float32[Array, "*lead N"]  # the low level's value of each edge
+    leaf: Int32[Array, "*lead"]  # where the path ends that is meant to be taken
 
 
 @struct.dataclass
@@ -106,6 +107,7 @@ def undecided(num_envs: int, num_nodes: int, ahead_shape: tuple[int, ...]) -> Hi
         log_prob=nothing,
         value=nothing,
         advice=jnp.zeros((num_envs, num_nodes), jnp.float32),
+        leaf=jnp.zeros(num_envs, jnp.int32),
     )
 
 

@@ -35,13 +35,21 @@ class Choice:
     value: Float32[Array, " B"]  # V^h of the remaining task
     advice: Float32[Array, "B N"]  # the low level's value of each edge; zeros where it is not used
     ahead: Float32[Array, "B N D P"]  # reach sets of the sub-tasks planned after each edge
+    leaf: Int32[Array, "B N"]  # where the path through each edge ends that is meant to be taken
+
+    @property
+    def judgement(self) -> Judgement:
+        """What was thought of the task, whichever edge is taken; the path is that through the likeliest."""
+        likeliest = self.logits.argmax(-1, keepdims=True)
+        return Judgement(self.value, self.advice, jnp.take_along_axis(self.leaf, likeliest, 1)[:, 0])
 
 
 class Judgement(NamedTuple):
-    """The high level's value of a task and the low level's advice on its edges; leading axis B."""
+    """What the high level thinks of a task; leading axis B."""
 
     value: Float32[Array, " B"]
     advice: Float32[Array, "B N"]
+    leaf: Int32[Array, " B"]  # where the path ends that it would take
 
 
 class Rewards(NamedTuple):
@@ -137,8 +145,7 @@ class HighLevel(abc.ABC):
         instructions: Instruction,
     ) -> Judgement:
         """What it thinks of relabelled tasks, where the choice was not its own."""
-        choice = self.choose(low, params, view, tree, state, instructions)
-        return Judgement(choice.value, choice.advice)
+        return self.choose(low, params, view, tree, state, instructions).judgement
 
     def low_level_rewards(self, experience: Experience) -> Rewards:
         """What the low level is paid, and when that ends: the task's rewards, until the episode ends."""

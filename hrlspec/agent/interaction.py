@@ -106,8 +106,8 @@ def decide(
         tree, instructions = take((book.tree, book.instructions), task)
         choice = agent.high.choose(agent.low, params, view, tree, state, instructions)
         edge, log_prob = jax.vmap(Categorical(noise.shape[-1]).sample)(choice.logits, noise)
-        ahead = choice.ahead[jnp.arange(edge.shape[0], dtype=jnp.int32), edge]
-        return HighDecision(jnp.ones(edge.shape, bool), edge, ahead, log_prob, choice.value, choice.advice)
+        ahead, leaf = take((choice.ahead, choice.leaf), jnp.arange(edge.shape[0], dtype=jnp.int32), edge)
+        return HighDecision(jnp.ones(edge.shape, bool), edge, ahead, log_prob, choice.value, choice.advice, leaf)
 
     before, task = worker.decision, worker.task
     settled = agent.high.settled(task_of(book, task), worker.task_state, book.forks[task])

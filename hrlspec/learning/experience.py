@@ -149,6 +149,8 @@ def _estimates(
     instructions = _instructions(agent, params, fresh, row, edge, node, new)
     _, value = jax.vmap(agent.low.control, in_axes=(None, 0, 0))(params, view, instructions)
     judgement = _judged(agent, params, fresh, view, row, node, flat(new.decided))
+    # The completed path is the one that counts; its nodes follow one another.
+    judgement = judgement._replace(leaf=flat(jnp.take_along_axis(new.path_length, slot, 1)))
 
     def shaped(x: Shaped[Array, "R ..."]) -> Shaped[Array, "E T ..."]:
         return x.reshape((*slot.shape, *x.shape[1:]))
@@ -160,6 +162,7 @@ def _estimates(
         log_prob=jnp.zeros_like(new.reward),
         value=shaped(judgement.value),
         advice=shaped(judgement.advice),
+        leaf=shaped(judgement.leaf),
     )
     low = LowDecision(
         action=rollout.low.action,
@@ -246,8 +249,9 @@ def _judged(
         state = dataclasses.replace(jax.vmap(initial)(tree), node=node)
         return agent.high.judge(agent.low, params, view, tree, state, instructions)
 
+    nothing = jnp.zeros(decided.shape, jnp.float32)
     unknown = Judgement(
-        jnp.zeros(decided.shape, jnp.float32), jnp.zeros((*decided.shape, fresh.tree.num_nodes), jnp.float32)
+        nothing, jnp.zeros((*decided.shape, fresh.tree.num_nodes), jnp.float32), nothing.astype(jnp.int32)
     )
     if agent.high.ppo is None:
         return unknown

@@ -161,25 +161,28 @@ def _with_values(
     def judge(inputs: tuple[View, Int32[Array, " B"], TaskState]) -> Judgement:
         view, task, state = inputs
         tree, instructions = take((book.tree, book.instructions), task)
-        choice = agent.high.choose(agent.low, setting.params, view, tree, state, instructions)
-        return Judgement(choice.value, choice.advice)
+        return agent.high.choose(agent.low, setting.params, view, tree, state, instructions).judgement
 
-    made, value, advice = jax.tree.map(flat, (steps.high.made, steps.high.value, steps.high.advice))
-    unknown = Judgement(worth, jnp.zeros_like(advice[: len(worth)]))
+    high = steps.high
+    made, before = jax.tree.map(flat, (high.made, Judgement(high.value, high.advice, high.leaf)))
+    unknown = jax.tree.map(lambda x: jnp.zeros_like(x[: len(worth)]), before)._replace(value=worth)
     if agent.high.follows_plan and agent.method.sees == "future":
         low = flat(steps.low.value)
-        known = Judgement(jnp.where(settled, low, value), jnp.where(settled[:, None], low[:, None], advice))
+        known = where(
+            settled, before._replace(value=low, advice=jnp.broadcast_to(low[:, None], before.advice.shape)), before
+        )
         value_last = in_groups(judge, ~settled_last, last, unknown, JUDGED_AT_ONCE).value
     else:
         rows, known, asked = jax.tree.map(
             lambda *x: jnp.concatenate(x),
-            (rows, Judgement(value, advice), made & settled),
+            (rows, before, made & settled),
             (last, unknown, jnp.ones_like(settled_last)),
         )
         known = in_groups(judge, asked, rows, known, JUDGED_AT_ONCE)
-        known, value_last = jax.tree.map(lambda x: x[: len(value)], known), known.value[len(value) :]
-    value, advice = jax.tree.map(lambda x: x.reshape((*steps.task.shape, *x.shape[1:])), tuple(known))
-    return dataclasses.replace(steps.high, value=value, advice=advice), value_last
+        value_last = known.value[len(made) :]
+        known = jax.tree.map(lambda x: x[: len(made)], known)
+    found = jax.tree.map(lambda x: x.reshape((*steps.task.shape, *x.shape[1:])), known)
+    return dataclasses.replace(high, **found._asdict()), value_last
 
 
 def _draw(key: Key[Array, ""], setting: Setting, correlation: Float32[Array, ""] | float) -> _Chance:

@@ -45,7 +45,8 @@ class NoChoice(Checked, HighLevel):
         root = jnp.arange(tree.num_nodes, dtype=jnp.int32) == TaskTree.ROOT
         logits = jnp.where(root, jnp.zeros(feasible.shape, jnp.float32), MASKED)
         value = low.value_of(params, view, instructions, logits.argmax(-1).astype(jnp.int32), feasible)
-        return Choice(logits, value, jnp.zeros(logits.shape, jnp.float32), instructions.ahead)
+        nothing = jnp.zeros(logits.shape, jnp.float32)
+        return Choice(logits, value, nothing, instructions.ahead, jnp.zeros(logits.shape, jnp.int32))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -156,7 +156,8 @@ class LogicValueIteration(Checked, HighLevel):
         best = jnp.where(feasible.any(-1), value.max(-1), 0.0)
         logits = jnp.where(feasible, self.sharpness * (value - best[:, None]), MASKED)
         value = low.value_of(params, view, instructions, logits.argmax(-1).astype(jnp.int32), feasible)
-        return Choice(logits, value, jnp.zeros(logits.shape, jnp.float32), instructions.ahead)
+        nothing = jnp.zeros(logits.shape, jnp.float32)
+        return Choice(logits, value, nothing, instructions.ahead, jnp.zeros(logits.shape, jnp.int32))
 
     def low_level_rewards(self, experience: Experience) -> Rewards:
         """Each option is over when its sub-task is, and earns 1 if it reached its goal, whatever the task pays."""

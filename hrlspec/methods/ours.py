@@ -7,6 +7,7 @@ Axes: **B** environments or decisions of a batch, **N** tree nodes, **L** paths 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, ClassVar, cast
 
 import jax
@@ -26,7 +27,8 @@ from hrlspec.agent.networks.tree import routes
 from hrlspec.config import Checked, Config, OptimiserConfig, PPOConfig, check_divides, setting
 from hrlspec.learning import ppo
 from hrlspec.learning.optimiser import Metrics
-from hrlspec.spec import TaskState, TaskTree, open_edges
+from hrlspec.methods.paths import Paths, best_of_edges, open_paths, sequence
+from hrlspec.spec import TaskState, TaskTree, initial, open_edges
 
 _NETWORK = PlannerConfig()
 _PPO = PPOConfig(
@@ -54,12 +56,17 @@ class ImplicitPlanner(Checked, HighLevel):
     transe_margin: float = setting(1.0, least=0, most=1e6)
     """Xi, the margin of the TransE loss."""
     advised: int = setting(12, least=1)
-    """Paths to a leaf that are valued for the advice; edges without one count as the worst of these."""
+    """Paths to a leaf that are valued side by side; edges without one count as the worst of these."""
+    values_paths: bool = False
+    """Whether V^h is asked about every path to a leaf, all other edges being blocked, and the choice follows these
+    values. Off: it is asked about the tree, and a policy of its own chooses, as in the paper."""
+    inverse_temperature: float = setting(400.0, least=0, most=1e6)
+    """Weight of these values in the logits."""
 
     @property
     def follows_plan(self) -> bool:
         """With the low level's advice the plan is the path that it values most."""
-        return self.network.advice > 0
+        return self.network.advice > 0 and not self.values_paths
 
     def num_samples(self, config: Config) -> int:
         """See :class:`HighLevel`."""
@@ -76,16 +83,19 @@ class ImplicitPlanner(Checked, HighLevel):
 
     def init(self, key: Key[Array, ""], low: LowLevel, view: View, tree: TaskTree) -> Any:
         """See :class:`HighLevel`."""
-        state = TaskState(jnp.int32(0), jnp.zeros(tree.num_nodes, bool), jnp.int32(0))
-        return self.planner(low).init(key, view, tree, state, jnp.zeros(tree.num_nodes, jnp.float32))
+        if self.values_paths:
+            return self.planner(low).init(key, view, tree, method="worth_of_view")
+        return self.planner(low).init(key, view, tree, initial(tree), jnp.zeros(tree.num_nodes, jnp.float32))
 
     def choose(
         self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, instructions: Instruction
     ) -> Choice:
         """See :class:`HighLevel`."""
+        if self.values_paths:
+            return self._choose_path(low, params, view, tree, state, instructions)
         advice, ahead = self.advise(low, params, view, tree, state, instructions)
         logits, value = self._plan(low, params["high"], view, tree, state, advice)
-        return Choice(logits, value, advice, ahead)
+        return Choice(logits, value, advice, ahead, jnp.zeros(logits.shape, jnp.int32))
 
     def judge(
         self,
@@ -102,9 +112,11 @@ class ImplicitPlanner(Checked, HighLevel):
         """
         if self.learns_from_copies or self.max_operator:
             return super().judge(low, params, view, tree, state, instructions)
-        return Judgement(
-            jnp.zeros(state.node.shape, jnp.float32), self.advise(low, params, view, tree, state, instructions)[0]
-        )
+        nothing = jnp.zeros(state.node.shape, jnp.float32)
+        advice = jnp.zeros(tree.parent.shape, jnp.float32)
+        if not self.values_paths:
+            advice, _ = self.advise(low, params, view, tree, state, instructions)
+        return Judgement(nothing, advice, nothing.astype(jnp.int32))
 
     def advise(
         self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, instructions: Instruction
@@ -122,25 +134,26 @@ class ImplicitPlanner(Checked, HighLevel):
         """
         if not self.network.advice:
             return jnp.zeros(tree.parent.shape, jnp.float32), instructions.ahead
-        edge, known, paths = jax.vmap(self._paths, in_axes=(None, 0, 0, 0))(low, tree, state, instructions)
-        num_paths = known.shape[1]
+        length = 1 + instructions.ahead.shape[2]
+        paths = jax.vmap(lambda tree, state: open_paths(tree, state, self.advised, length))(tree, state)
+        each = jax.vmap(self._instructions, in_axes=(None, 0, 0, 0))(low, tree, paths, instructions)
 
         def value(inputs: tuple[Int32[Array, " G"], Instruction]) -> Float32[Array, " G"]:
             env, path = inputs
-            seen = take(view, env)
-            return jax.vmap(low.control, in_axes=(None, 0, 0))(params, seen, path)[1]
+            return jax.vmap(low.control, in_axes=(None, 0, 0))(params, take(view, env), path)[1]
 
-        env = jnp.repeat(jnp.arange(known.shape[0], dtype=jnp.int32), num_paths)
-        flat_paths = jax.tree.map(lambda x: x.reshape((known.size, *x.shape[2:])), paths)
-        group = max(known.shape[0], 16)  # of fewer rows a matrix product costs nearly as much
-        values = in_groups(value, known.reshape(-1), (env, flat_paths), jnp.zeros(env.shape, jnp.float32), group)
-        advice, ahead = jax.vmap(_best_paths)(edge, known, values.reshape(known.shape), paths.ahead, instructions.ahead)
+        values = self._value_of_paths(value, paths.known, each)
+        advice, row, has_one = jax.vmap(best_of_edges, in_axes=(0, 0, None))(paths, values, tree.parent.shape[1])
+        best = jax.vmap(lambda ahead, row: ahead[row])(each.ahead, row)
+        ahead = jnp.where(has_one[..., None, None], best, instructions.ahead)
         return jax.lax.stop_gradient(advice), ahead
 
     def loss(
         self, low: LowLevel, params: Any, batch: HighBatch, progress: Float32[Array, ""]
     ) -> tuple[Float32[Array, ""], Metrics]:
         """PPO and TransE loss on a minibatch ``[B]`` (eqs. 4 and 5)."""
+        if self.values_paths:
+            return self._loss_of_paths(low, params, batch)
         decision = batch.decision
         logits, value = self._plan(low, params, batch.view, batch.tree, batch.state, decision.advice)
         choices = Categorical(logits.shape[-1])
@@ -155,10 +168,7 @@ class ImplicitPlanner(Checked, HighLevel):
             self.ppo,
             progress,
         )
-        if self.transe:
-            metrics["transe_loss"] = self.transe_loss(self.planner(low), params, batch)
-            loss = loss + self.transe * metrics["transe_loss"]
-        return loss, metrics
+        return self._with_transe(low, params, batch, loss, metrics)
 
     def transe_loss(self, planner: Planner, params: Any, batch: HighBatch) -> Float32[Array, ""]:
         """Predicted latents near the ones reached, other states' latents at least the margin away (eq. 4)."""
@@ -182,34 +192,72 @@ class ImplicitPlanner(Checked, HighLevel):
         plan = jax.vmap(self.planner(low).apply, in_axes=(None, 0, 0, 0, 0))
         return cast("tuple[Array, Array]", plan(params, view, tree, state, advice))
 
-    def _paths(
-        self, low: LowLevel, tree: TaskTree, state: TaskState, instructions: Instruction
-    ) -> tuple[Int32[Array, " L"], Bool[Array, " L"], Instruction]:
-        """The paths open in one environment: first edges ``[L]``, which of them exist ``[L]``, and instructions."""
-        num_nodes = tree.num_nodes
-        path = routes(tree, state.node, 1 + instructions.ahead.shape[1])
-        leads = tree.accepting & (path[:, 0] >= 0) & open_edges(tree, state)[path[:, 0]]
-        leaf = jnp.nonzero(leads, size=min(self.advised, num_nodes), fill_value=num_nodes)[0]
-        path = path[jnp.minimum(leaf, num_nodes - 1)]
-        edge, later = path[:, 0], path[:, 1:]
+    def _with_transe(
+        self, low: LowLevel, params: Any, batch: HighBatch, loss: Float32[Array, ""], metrics: Metrics
+    ) -> tuple[Float32[Array, ""], Metrics]:
+        if not self.transe:
+            return loss, metrics
+        error = self.transe_loss(self.planner(low), params, batch)
+        return loss + self.transe * error, {**metrics, "transe_loss": error}
+
+    def _instructions(self, low: LowLevel, tree: TaskTree, paths: Paths, instructions: Instruction) -> Instruction:
+        """The instructions for the first sub-tasks of one environment's paths, ``[L]``."""
+        later = paths.nodes[:, 1:]
         ahead = tree.reach[later] & (later >= 0)[..., None] & (low.sees == "future")
-        some = dataclasses.replace(take(instructions, edge), ahead=ahead.astype(jnp.float32))
-        return edge, leaf < num_nodes, some
+        return dataclasses.replace(take(instructions, paths.edge), ahead=ahead.astype(jnp.float32))
 
+    def _value_of_paths(
+        self,
+        value: Callable[[tuple[Int32[Array, " G"], Any]], Float32[Array, " G"]],
+        known: Bool[Array, "B L"],
+        inputs: Any,
+    ) -> Float32[Array, "B L"]:
+        """``value`` of (environment, inputs) where there is a path, many at a time; zeros elsewhere."""
+        num_envs, num_paths = known.shape
+        env = jnp.repeat(jnp.arange(num_envs, dtype=jnp.int32), num_paths)
+        inputs = jax.tree.map(lambda x: x.reshape((known.size, *x.shape[2:])), inputs)
+        group = max(num_envs, 16)  # of fewer rows a matrix product costs nearly as much
+        nothing = jnp.zeros(env.shape, jnp.float32)
+        return in_groups(value, known.reshape(-1), (env, inputs), nothing, group).reshape(known.shape)
 
-def _best_paths(
-    edge: Int32[Array, " L"],
-    known: Bool[Array, " L"],
-    values: Float32[Array, " L"],
-    path_ahead: Float32[Array, "L D P"],
-    default_ahead: Float32[Array, "N D P"],
-) -> tuple[Float32[Array, " N"], Float32[Array, "N D P"]]:
-    """From values of paths ``[L]`` to each edge's best value ``[N]`` and what lies ahead on its best path."""
-    mine = (edge == jnp.arange(default_ahead.shape[0], dtype=jnp.int32)[:, None]) & known
-    score = jnp.where(mine, values, -jnp.inf)
-    worst = jnp.where(known.any(), jnp.where(known, values, jnp.inf).min(), 0.0)
-    advice = jnp.where(mine.any(1), score.max(1), worst)
-    return advice, jnp.where(mine.any(1)[:, None, None], path_ahead[score.argmax(1)], default_ahead)
+    def _choose_path(
+        self, low: LowLevel, params: Params, view: View, tree: TaskTree, state: TaskState, instructions: Instruction
+    ) -> Choice:
+        """Edges by V^h of the best path through each, all edges beside the path being blocked."""
+        planner, own, num_nodes = self.planner(low), params["high"], tree.parent.shape[1]
+        length = self._length(num_nodes)
+        paths = jax.vmap(lambda tree, state: open_paths(tree, state, self.advised, length))(tree, state)
+        each = jax.vmap(jax.vmap(sequence, in_axes=(None, None, 0)))(tree, state.node, paths.nodes)
+        latent = jax.vmap(lambda view: planner.apply(own, view, method="encode"))(view)
+
+        def value(inputs: tuple[Int32[Array, " G"], TaskTree]) -> Float32[Array, " G"]:
+            env, path = inputs
+            worth = jax.vmap(lambda latent, path: planner.apply(own, latent, path, method="worth"))
+            return cast(Array, worth(take(latent, env), path))
+
+        values = self._value_of_paths(value, paths.known, each)
+        of_edges, row, _ = jax.vmap(best_of_edges, in_axes=(0, 0, None))(paths, values, num_nodes)
+        feasible = jax.vmap(open_edges)(tree, state)
+        best = jnp.where(feasible.any(1), jnp.where(feasible, of_edges, -jnp.inf).max(1), 0.0)
+        logits = jnp.where(feasible, self.inverse_temperature * (of_edges - best[:, None]), MASKED)
+        leaf = jnp.take_along_axis(paths.leaf, row, 1)
+        return Choice(logits, best, jnp.zeros_like(of_edges), instructions.ahead, leaf)
+
+    def _loss_of_paths(self, low: LowLevel, params: Any, batch: HighBatch) -> tuple[Float32[Array, ""], Metrics]:
+        """The error of V^h of the paths that were meant to be taken, and the TransE loss."""
+        planner, num_nodes = self.planner(low), batch.tree.parent.shape[1]
+
+        def worth(view: View, tree: TaskTree, node: Int32[Array, ""], leaf: Int32[Array, ""]) -> Float32[Array, ""]:
+            path = sequence(tree, node, routes(tree, node, self._length(num_nodes))[leaf])
+            return cast(Array, planner.apply(params, view, path, method="worth_of_view"))
+
+        value = jax.vmap(worth)(batch.view, batch.tree, batch.state.node, batch.decision.leaf)
+        error = ppo.value_loss(value, batch.credit.target, batch.credit.valid)
+        return self._with_transe(low, params, batch, self.ppo.value_coefficient * error, {"value_loss": error})
+
+    def _length(self, num_nodes: int) -> int:
+        """Sub-tasks of a path that are seen: as many as there are rounds of message passing, if these have a limit."""
+        return min(self.network.rounds or num_nodes, num_nodes - 1)
 
 
 def _distance(x: Float32[Array, "B latent"], y: Float32[Array, "B latent"]) -> Float32[Array, " B"]:

@@ -32,12 +32,12 @@ _LEARNING_RATES: dict[tuple[Recipe, str], float] = {
 
 def letter(settings: Settings, recipe: Recipe) -> Settings:
     """A recipe as it is, but for how the low level learns."""
-    return settings if recipe == "paper" else once(settings, minibatches=40)
+    return settings if recipe != "hrlspec" else once(settings, minibatches=40)
 
 
 def letter_with_bonuses(settings: Settings, recipe: Recipe) -> Settings:
     """Reward set 2."""
-    return settings if recipe == "paper" else twice(settings)
+    return settings if recipe != "hrlspec" else twice(settings)
 
 
 def _twelve(settings: Settings, recipe: Recipe) -> Settings:

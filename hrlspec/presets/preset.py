@@ -62,7 +62,8 @@ class Preset:
 
         Args:
             method: by name, with the planner's settings as the recipe has them; or a value, whose settings stay.
-            recipe_name: ``paper``, the paper's method fitted to the world, or ``hrlspec``, what measured better.
+            recipe_name: ``paper``, the paper's method fitted to the world; ``planner``, the same, but that V^h is asked
+                about every path; or ``hrlspec``, what measured better.
             reward_set: 1 or 2.
 
         Raises:
@@ -77,11 +78,12 @@ class Preset:
         config = chosen.configure(settings.config)
         # An ablation is ours but for one thing.
         tuned = "ours" if isinstance(chosen.high, ImplicitPlanner) else chosen.name
-        rate = self.learning_rates.get((recipe_name, tuned), config.low.optimiser.learning_rate)
+        family: Recipe = "hrlspec" if recipe_name == "hrlspec" else "paper"
+        rate = self.learning_rates.get((family, tuned), config.low.optimiser.learning_rate)
         return evolve(config, {"low.optimiser.learning_rate": rate}), chosen
 
     def effort(self, recipe_name: Recipe) -> Effort:
-        """How much a recipe's programs are compiled with; recipe ``paper`` has more around its matrix products."""
+        """How much a recipe's programs are compiled with; the others have more around its matrix products."""
         return self.compiled_with if recipe_name == "hrlspec" else "most"
 
     def rewards(self, reward_set: RewardSet = 1) -> RewardMachine:

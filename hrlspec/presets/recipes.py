@@ -10,7 +10,7 @@ from typing import Any, Literal
 from hrlspec.config import Config, NetworkConfig, evolve
 from hrlspec.methods import ImplicitPlanner
 
-Recipe = Literal["paper", "hrlspec"]
+Recipe = Literal["paper", "planner", "hrlspec"]
 RECIPES: tuple[Recipe, ...] = typing.get_args(Recipe)
 RewardSet = Literal[1, 2]
 
@@ -29,7 +29,7 @@ class Settings:
 
 def recipe(name: Recipe) -> Settings:
     """The settings of a recipe for a small world of discrete actions: Letter's."""
-    return _PAPER if name == "paper" else _HRLSPEC
+    return {"paper": _PAPER, "planner": _PLANNER, "hrlspec": _HRLSPEC}[name]
 
 
 def with_bonuses(settings: Settings, name: Recipe) -> Settings:
@@ -45,6 +45,9 @@ def with_bonuses(settings: Settings, name: Recipe) -> Settings:
     )
     if name == "paper":
         return settings
+    if name == "planner":
+        # As sharp as in set 1, per unit of return.
+        return settings.evolve({"planner.inverse_temperature": settings.planner.inverse_temperature / 5.0})
     return settings.evolve(
         {
             # By their size alone the advantages of a bonus would drown all others.
@@ -118,6 +121,9 @@ def continuous(settings: Settings, learning_rate: float) -> Settings:
 # Two blocks, so that two devices share them. A decision is rare; groups are no larger than what is due at a time.
 _SHARED = evolve(Config(), {"blocks": 2, "group": 8})
 _PAPER = Settings(_SHARED, ImplicitPlanner())
+# The planner is asked what each path on is worth, and so needs no policy: sequences, of which the curriculum is made
+# and which leave nothing to choose, teach it as well as choices do.
+_PLANNER = _PAPER.evolve({"planner.values_paths": True})
 _HRLSPEC = Settings(
     config=evolve(
         _SHARED,

@@ -41,7 +41,7 @@ def walk(settings: Settings, recipe: Recipe) -> Settings:
 
 def walk_with_bonuses(settings: Settings, recipe: Recipe) -> Settings:
     """Reward set 2, where one pair of regions in ten pays a bonus: rare, and worth more than all the rest."""
-    if recipe == "paper":
+    if recipe != "hrlspec":
         return settings
     return settings.evolve(
         {

@@ -32,7 +32,7 @@ def zone(settings: Settings, recipe: Recipe) -> Settings:
             "config.curriculum.max_avoid": 2,
         }
     )
-    return _of_paper(settings) if recipe == "paper" else once(settings, minibatches=20)
+    return _of_paper(settings) if recipe != "hrlspec" else once(settings, minibatches=20)
 
 
 def _of_paper(settings: Settings) -> Settings:
@@ -57,7 +57,7 @@ def _of_paper(settings: Settings) -> Settings:
 def zone_with_bonuses(settings: Settings, recipe: Recipe) -> Settings:
     """Reward set 2, where orders of colours pay ten and twenty times as much as a sub-task."""
     # Beside the critic's errors what a step gains is small: paid for entropy, the policy came to act at random.
-    return settings if recipe == "paper" else twice(settings).evolve({"config.low.entropy": 0.0})
+    return settings if recipe != "hrlspec" else twice(settings).evolve({"config.low.entropy": 0.0})
 
 
 _BONUSES = (Bonus("green", "red", 10.0), Bonus("red", "blue", 20.0, ("yellow",)))

@@ -36,7 +36,8 @@ class RunFlags(Checked):
     method: str = "ours"
     """A name from above, or module:VALUE."""
     recipe: Recipe = "hrlspec"
-    """paper: the paper's method, made to learn; hrlspec: what was measured to be better."""
+    """paper: the paper's method, made to learn; planner: the same, but that the planner is asked about every path on;
+    hrlspec: what was measured to be better."""
     reward_set: RewardSet = 1
     """1: 1 for completing the task; 2: also for sub-tasks and for visiting some in order."""
     seed: int = setting(0, least=0, most=_LAST_SEED)

@@ -48,7 +48,8 @@ class ByIndex(HighLevel):
         index = jnp.arange(tree.num_nodes)
         wish = jnp.where(params["last"], index, -index).astype(jnp.float32)
         logits = jnp.where(jax.vmap(open_edges)(tree, state), wish, -FAR)
-        return Choice(logits, jnp.zeros(len(logits)), jnp.zeros(logits.shape), instruction.ahead)
+        nothing = jnp.zeros(logits.shape)
+        return Choice(logits, nothing[:, 0], nothing, instruction.ahead, nothing.astype(jnp.int32))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -66,6 +66,7 @@ def dotted(settings: Any, prefix: str = "") -> dict[str, Any]:
 
 
 ADDED = {"config.blocks": 1}
+ADDED_TO_PLANNERS = {f"{_PLANNER}.values_paths": False, f"{_PLANNER}.inverse_temperature": 400.0}
 """What records lack that are older than these settings, and what they would have said."""
 BEFORE = {
     "config.blocks": (1,),
@@ -97,7 +98,7 @@ def _translated(settings: Mapping[str, Any]) -> dict[str, Any]:
         now = _renamed(now)
     if not now["config.shield.enabled"]:
         now = {name: value for name, value in now.items() if not name.startswith("config.shield.")}
-    return ADDED | now
+    return ADDED | (ADDED_TO_PLANNERS if f"{_PLANNER}.transe" in now else {}) | now
 
 
 def _renamed(old: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import pytest
 
 from envs_jax import Box, Environment
 from hrlspec.agent.agent import Agent
-from hrlspec.config import Config
+from hrlspec.config import Config, evolve
 from hrlspec.learning.train import Trainer
 from hrlspec.methods import LTL2ACTION, METHODS, MYOPIC_LOW, NO_ER, OPTION, ImplicitPlanner, Ours
 from hrlspec.presets import PRESETS, RECIPES, Recipe, RewardSet, preset, preset_for
@@ -144,6 +144,12 @@ def test_what_distinguishes_the_recipes(name: str) -> None:
     assert paper.relabel.share == 0.5
     assert (planner.max_operator, planner.learns_unfinished, planner.learns_from_copies) == (True, False, True)
     assert (planner.network.rounds, planner.network.advice, planner.transe) == (8, 0, 0.01)
+    # Recipe planner departs in one thing.
+    for reward_set, temperature in ((1, 400.0), (2, 80.0)):
+        config, method = preset(name).settings("ours", "planner", reward_set)
+        as_written, written = preset(name).settings("ours", "paper", reward_set)
+        changes = {"high.values_paths": True, "high.inverse_temperature": temperature}
+        assert (config, method) == (as_written, evolve(written, changes))
     ours, planner = config_of(name), planner_of(name)
     assert ours.network.roles
     assert ours.network.symmetric
@@ -156,7 +162,7 @@ def test_what_distinguishes_the_recipes(name: str) -> None:
 def test_reward_set_2() -> None:
     for name, recipe in itertools.product(PRESETS, RECIPES):
         assert config_of(name, recipe=recipe, reward_set=2).network.names
-        scale = {"paper": 0.0, "hrlspec": 1.0}[recipe]
+        scale = {"paper": 0.0, "planner": 0.0, "hrlspec": 1.0}[recipe]
         assert config_of(name, recipe=recipe, reward_set=2).low.advantage_scale == scale
         assert config_of(name, recipe=recipe).low.advantage_scale == 0
     assert planner_of("letter", reward_set=2).network.advice == 80

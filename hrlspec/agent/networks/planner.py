@@ -22,7 +22,7 @@ from hrlspec.agent.networks.messages import Rounds, Sweep
 from hrlspec.agent.networks.rows import where_needed
 from hrlspec.agent.networks.transition import Transition
 from hrlspec.config import Checked, NetworkConfig, setting
-from hrlspec.spec import TaskState, TaskTree, open_edges, subtask_avoid
+from hrlspec.spec import TaskState, TaskTree, initial, open_edges, subtask_avoid
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,6 +106,16 @@ class Planner(nn.Module):
         A blocked edge sends no message.
         """
         return self.messages(self.project(latents), tree, state)
+
+    def worth(self, latent: Float32[Array, " latent"], sequence: TaskTree) -> Float32[Array, ""]:
+        """V^h of a sequence of sub-tasks, none of them done, from the latent of an observation, ``[]``."""
+        start = initial(sequence)
+        embeddings = self.embed(self.transition.down(latent, sequence, start.node), sequence, start)
+        return self.value(embeddings[TaskTree.ROOT])[0]
+
+    def worth_of_view(self, view: tuple[Planes, Shared], sequence: TaskTree) -> Float32[Array, ""]:
+        """The same from an observation."""
+        return self.worth(self.encode(view), sequence)
 
     def __call__(
         self, view: tuple[Planes, Shared], tree: TaskTree, state: TaskState, advice: Float32[Array, " N"]
