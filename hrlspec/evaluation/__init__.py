@@ -1,10 +1,11 @@
-"""Evaluation: success, SPL, return over optimum and contested choice on unseen tasks."""
+"""Evaluation on unseen tasks: success, SPL, return over optimum, first and contested choices."""
 
 from __future__ import annotations
 
 from hrlspec.evaluation.aggregate import Aggregate, aggregate
 from hrlspec.evaluation.cases import BranchCases, Cases, make_branch_cases, make_cases
 from hrlspec.evaluation.episodes import Episodes, run_episodes
+from hrlspec.evaluation.first_choice import FirstChoiceEvaluation, FirstChoiceResult, first_choice_evaluation
 from hrlspec.evaluation.protocol import (
     ChoiceEvaluation,
     ReturnEvaluation,
@@ -25,6 +26,8 @@ __all__ = [
     "ChoiceEvaluation",
     "ChoiceResult",
     "Episodes",
+    "FirstChoiceEvaluation",
+    "FirstChoiceResult",
     "ReturnEvaluation",
     "ReturnResult",
     "Score",
@@ -36,6 +39,7 @@ __all__ = [
     "choice_evaluation",
     "evaluate_suite",
     "final_evaluation",
+    "first_choice_evaluation",
     "make_branch_cases",
     "make_cases",
     "periodic_evaluation",

@@ -72,12 +72,18 @@ def planned_steps(
     Returns:
         Two float32 ``[L]``.
     """
+    kept, which = distinct(layouts)
+    grid = grid_of(env, kept)
+    return shortest_steps(grid, tree)[which], nearest_first_steps(grid, tree)[which]
+
+
+def distinct(layouts: Layout) -> tuple[Layout, Int[np.ndarray, " L"]]:
+    """Each layout once (a layout pytree with a leading axis), and which of these each of the L is, int ``[L]``."""
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(layouts)]
     first: dict[bytes, int] = {}
     alike = [first.setdefault(b"".join(leaf[i].tobytes() for leaf in leaves), i) for i in range(len(leaves[0]))]
     kept, which = np.unique(alike, return_inverse=True)
-    grid = grid_of(env, jax.tree.map(lambda x: np.asarray(x)[kept], layouts))
-    return shortest_steps(grid, tree)[which], nearest_first_steps(grid, tree)[which]
+    return jax.tree.map(lambda x: np.asarray(x)[kept], layouts), which
 
 
 def shortest_steps(grid: Grid, tree: TaskTree) -> Float32[np.ndarray, " L"]:

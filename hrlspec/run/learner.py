@@ -15,12 +15,14 @@ import numpy as np
 from hrlspec.agent.low_level import Params
 from hrlspec.evaluation import (
     ChoiceResult,
+    FirstChoiceResult,
     ReturnResult,
     Suite,
     SuiteEvaluation,
     SuiteResult,
     choice_evaluation,
     final_evaluation,
+    first_choice_evaluation,
     periodic_evaluation,
     return_evaluation,
 )
@@ -45,11 +47,13 @@ class FinalResults:
         suite: on unseen tasks.
         choice: contested choice, where the environment allows it and it was asked for.
         returns: return over optimum, under reward set 2 where the environment allows it.
+        first_choice: how often the first sub-task is the best one, where that is known and the high level assigns any.
     """
 
     suite: SuiteResult
     choice: ChoiceResult | None
     returns: ReturnResult | None
+    first_choice: FirstChoiceResult | None
 
     def to_json(self) -> dict[str, Any]:
         """A dictionary for ``json.dumps``."""
@@ -57,6 +61,7 @@ class FinalResults:
             "suite": self.suite.to_json(),
             "contested_choice": None if self.choice is None else self.choice.to_json(),
             "return_over_optimum": None if self.returns is None else self.returns.to_json(),
+            "first_choice": None if self.first_choice is None else self.first_choice.to_json(),
         }
 
 
@@ -108,17 +113,22 @@ class Learner:
         how = self.agent, params, self.machine
         suite = self.test_suite.take(_spread(len(self.test_suite), settings.final_tasks))
         result = final_evaluation(self.env, suite, episodes=len(suite), greedy=settings.greedy)(keys[0], *how)
-        choice = returns = None
+        choice = returns = first = None
+        if self.agent.method.sees != "whole task":
+            # There may be no such case, or nothing by which to tell what is best.
+            with contextlib.suppress(ValueError):
+                evaluation = first_choice_evaluation(self.env, suite, self.machine, greedy=settings.greedy)
+                first = evaluation(jax.random.fold_in(self._key(_FINAL_STREAM), 3), *how)
         if settings.contested and isinstance(self.env, Contestable):
             # An environment of somebody else's may be of that kind and yet have hardly any such layout.
             with contextlib.suppress(ValueError):
-                evaluation = choice_evaluation(self.env, num_cases=settings.contested, greedy=settings.greedy)
-                choice = evaluation(keys[1], *how)
+                contested = choice_evaluation(self.env, num_cases=settings.contested, greedy=settings.greedy)
+                choice = contested(keys[1], *how)
         if self.experiment.reward_set == 2 and "branches" in self.preset.suite_names:
             branches = self.preset.suite("branches")
             branches = branches.take(_spread(len(branches), settings.final_tasks))
             returns = return_evaluation(self.env, branches, self.machine, greedy=settings.greedy)(keys[2], *how)
-        return FinalResults(result, choice, returns)
+        return FinalResults(result, choice, returns, first)
 
     @functools.cached_property
     def test_suite(self) -> Suite:

@@ -57,6 +57,15 @@ def suite_table(result: SuiteResult) -> Table:
 def final_tables(results: FinalResults) -> list[Table]:
     """Everything a run ends with."""
     tables = [suite_table(results.suite)]
+    if results.first_choice is not None:
+        first = results.first_choice
+        table = plain_table(
+            f"First choice where it matters ({first.episodes} cases)",
+            ["best first sub-task", "chance"],
+            f"best by {first.by}; the decision itself is counted, whatever comes of it",
+        )
+        table.add_row(_cell(first.rate), f"{first.chance:.3f}")
+        tables.append(table)
     if results.choice is not None:
         choice = results.choice
         table = plain_table(

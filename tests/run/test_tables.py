@@ -8,7 +8,7 @@ import io
 import pytest
 from rich.console import Console
 
-from hrlspec.evaluation import Aggregate, ChoiceResult, ReturnResult, Score, SuiteResult, TaskScore
+from hrlspec.evaluation import Aggregate, ChoiceResult, FirstChoiceResult, ReturnResult, Score, SuiteResult, TaskScore
 from hrlspec.evaluation.stats import Interval
 from hrlspec.run.console import PlainConsole
 from hrlspec.run.learner import FinalResults
@@ -92,12 +92,15 @@ def test_what_a_run_ends_with() -> None:
     returns = ReturnResult(
         "branches", False, 100, 5, "tasks", Interval(0.95, 0.9, 1.0), Interval(1, 1, 1), 0.5, 0.75, {}
     )
-    text = "\n".join("\n".join(lines(table)) for table in final_tables(FinalResults(result(), choice, returns)))
+    first = FirstChoiceResult("dag", False, 900, 5, "steps", Interval(0.92, 0.9, 0.94), 0.45)
+    everything = FinalResults(result(), choice, returns, first)
+    text = "\n".join("\n".join(lines(table)) for table in final_tables(everything))
+    assert "0.920 [.90,.94]" in text
     assert "Contested choice (400 layouts)" in text
     assert "0.900 [.85,.95]" in text
     assert "0.950 [.90,1.00]" in text
     assert "0.750" in text
-    assert len(final_tables(FinalResults(result(), None, None))) == 1
+    assert len(final_tables(FinalResults(result(), None, None, None))) == 1
 
 
 @pytest.mark.parametrize("iqm", [None, Interval(0.97, 0.96, 0.98)])
