@@ -317,39 +317,40 @@ class ContestedLayouts(Environment):
         """
 
 
-class ContestedChoice(ContestedLayouts):
-    """An environment whose contested layouts also serve evaluation; for those without an exact solver.
+class ContestedChoice(Environment):
+    """An environment that knows how long the ways over the instances of a goal are; for those without an exact solver.
 
-    There are two instances of the first proposition, and the way a layout is drawn says which is the right one.
+    Of each proposition there are I instances.
     """
 
     @property
     @abc.abstractmethod
     def contested_pairs(self) -> tuple[tuple[int, int], ...]:
-        """Indices of (first, second) propositions that contested layouts can be about."""
+        """Indices of (first, second) propositions that a choice between instances can be about."""
+
+    @property
+    @abc.abstractmethod
+    def least_detour(self) -> float:
+        """How much longer a way is that counts as longer, in the unit of `ways`."""
+
+    @abc.abstractmethod
+    def ways(
+        self, layout: Layout, first: Bool[Array, " P"], second: Bool[Array, " P"]
+    ) -> tuple[Float32[Array, " I"], Float32[Array, " I"]]:
+        """How far the instances of one goal are, and how long the whole way is over each and on to another goal.
+
+        Args:
+            layout: unbatched.
+            first: one-hot bool ``[P]``, what is to be reached first.
+            second: one-hot bool ``[P]``, what is to be reached after it.
+
+        Returns:
+            Two float32 ``[I]``; a way that leads over another instance of the first goal is infinitely long.
+        """
 
     @abc.abstractmethod
     def instance_at(self, state: State, goal: Bool[Array, " P"]) -> Int32[Array, ""]:
         """Which instance of a proposition (``goal``, one-hot bool ``[P]``) the agent is nearest to, int32 ``[]``."""
-
-    @abc.abstractmethod
-    def contested_layout(
-        self,
-        key: Key[Array, ""],
-        first: Bool[Array, " P"],
-        second: Bool[Array, " P"],
-        params: EnvParams,
-        mirrored: Bool[Array, ""] | bool = False,
-    ) -> Layout:
-        """As in :class:`ContestedLayouts`; instance 0 of the first proposition is the right one.
-
-        Args:
-            key: consumed.
-            first: bool ``[P]``, what is to be reached first.
-            second: bool ``[P]``, what is to be reached after it.
-            params: of the environment.
-            mirrored: bool ``[]``, draw the control instead, on which the nearest instance is the right one: number 0.
-        """
 
 
 class Drawable(Environment):

@@ -2,7 +2,7 @@
 
 The task they are for is "first colour, then second". On a contested layout the nearer zone of the first colour lies
 away from the only goal that is close to the other one, so that starting with the nearest makes the whole way longer.
-On its mirrored control both zones of the first colour are reflected through the robot: now the nearer one is right.
+Such layouts are drawn to be trained on. Whoever tests takes layouts of all kinds and asks for the `ways` in them.
 """
 
 from __future__ import annotations
@@ -57,21 +57,19 @@ def contested_layout(
     first: Int[Array, ""] | int,
     second: Int[Array, ""] | int,
     *,
-    mirrored: Bool[Array, ""] | bool = False,
     needed: Bool[Array, ""] | bool = True,
 ) -> ZoneLayout:
-    """A random contested layout, or with the same key its mirrored control. The key is consumed.
+    """A random contested layout. The key is consumed.
 
     Args:
-        key: decides everything but the colours and the reflection.
+        key: decides everything but the colours.
         first: int ``[]``, index of the colour to go to first.
         second: int ``[]``, index of the colour to go to then; another one.
-        mirrored: bool ``[]``, whether the control is wanted.
         needed: bool ``[]``; where false, no layout is drawn and what is returned means nothing.
 
     Returns:
         The layout. ``zones[first, 0]`` is the better zone of the first colour, ``zones[first, 1]`` the other, and
-        ``zones[second, 0]`` the goal; so the nearer zone of the first colour is number 1, or 0 on the control.
+        ``zones[second, 0]`` the goal; the nearer zone of the first colour is number 1.
     """
 
     def attempt(carry: tuple[Array, _Core, Array, Array]) -> tuple[Array, _Core, Array, Array]:
@@ -87,11 +85,10 @@ def contested_layout(
     _, core, rest, _ = jax.lax.while_loop(lambda carry: ~carry[3], attempt, start)
 
     pair = jnp.stack([core.better, core.nearer])
-    reflected = 2 * core.robot - pair[::-1]
     index = jnp.arange(len(COLOURS), dtype=jnp.int32)
     other = (index != first) & (index != second)
     zones = rest[1:].reshape(-1, ZONES_EACH, 2)[jnp.clip(jnp.cumsum(other) - 1, 0, 1)]
-    zones = jnp.where((index == first)[:, None, None], jnp.where(mirrored, reflected, pair), zones)
+    zones = jnp.where((index == first)[:, None, None], pair, zones)
     zones = jnp.where((index == second)[:, None, None], jnp.stack([core.goal, rest[0]]), zones)
     return ZoneLayout(robot=jnp.concatenate([core.robot, heading[None]]), zones=zones)
 
@@ -117,8 +114,7 @@ def _draw_core(key: Key[Array, ""]) -> tuple[_Core, Bool[Array, ""]]:
         nearer=robot + nearer[:, None] * back,
         goal=robot + distance[:, None] * ahead,
     )
-    # The control must do as well, so its zones keep their distances too.
-    zones = jnp.stack([core.better, core.nearer, *_reflected(core)])
+    zones = jnp.stack([core.better, core.nearer])
     valid = (_distance(zones, core.goal) >= APART).all(0) & (nearer + _NEARER_BY <= better)
     valid &= (jnp.abs(zones) <= _REACH).all((0, 2)) & (jnp.abs(core.goal) <= _REACH).all(-1)
     best = jnp.argmax(valid)
@@ -126,12 +122,8 @@ def _draw_core(key: Key[Array, ""]) -> tuple[_Core, Bool[Array, ""]]:
 
 
 def _draw_rest(key: Key[Array, ""], core: _Core) -> tuple[Float[Array, "..."], Bool[Array, ""]]:
-    """The other zone of the second colour and those of the other two colours ``[5, 2]``, and whether all found a place.
-
-    They keep away from the first zones' reflections as well, so that a contested layout and its control share them.
-    """
-    near, far = _reflected(core)
-    core_zones = jnp.stack([core.goal, core.better, core.nearer, near, far])
+    """The other zone of the second colour and those of the other two ``[5, 2]``, and whether all found a place."""
+    core_zones = jnp.stack([core.goal, core.better, core.nearer])
     draws = jax.random.uniform(key, (_REST, MOST_DRAWS, 2), jnp.float32, minval=-_REACH, maxval=_REACH)
 
     def place(
@@ -141,7 +133,7 @@ def _draw_rest(key: Key[Array, ""], core: _Core) -> tuple[Float[Array, "..."], B
         free = (index > 0) | _is_contested(core, candidates)
         for zones in (placed, core_zones):
             free &= (_distance(candidates[:, None], zones) >= 2 * ZONE_KEEPOUT).all(-1)
-        for end in (core.goal, core.nearer, far):
+        for end in (core.goal, core.nearer):
             free &= _distance_to_way(candidates, core.robot, end) >= CLEARANCE
         found = candidates[jnp.argmax(free)]
         return jnp.where((np.arange(_REST) == index)[:, None], found, placed), (found, free.any())
@@ -152,19 +144,28 @@ def _draw_rest(key: Key[Array, ""], core: _Core) -> tuple[Float[Array, "..."], B
 
 
 def _is_contested(core: _Core, other_goal: Float[Array, "... 2"]) -> Bool[Array, "..."]:
-    """Whether the better zone makes the whole way shorter here and on the control; bool ``[...]`` for ``[..., 2]``."""
+    """Whether the better zone makes the whole way shorter; bool ``[...]`` for ``[..., 2]``."""
 
     def way(over: Float[Array, "... 2"]) -> Float[Array, "..."]:
         onward = jnp.minimum(_distance(over, core.goal), _distance(over, other_goal))
         return _distance(core.robot, over) + onward
 
-    near, far = _reflected(core)
-    return (way(core.better) + LEAST_DETOUR <= way(core.nearer)) & (way(near) + LEAST_DETOUR <= way(far))
+    return way(core.better) + LEAST_DETOUR <= way(core.nearer)
 
 
-def _reflected(core: _Core) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """The first zones of the control: the nearer one, now on the goal's side, and the other."""
-    return 2 * core.robot - core.nearer, 2 * core.robot - core.better
+def ways(
+    layout: ZoneLayout, first: Int[Array, ""] | int, second: Int[Array, ""] | int
+) -> tuple[Float[Array, " zones"], Float[Array, " zones"]]:
+    """How far each zone of one colour is from the robot (m), and how long the way over it to another colour is (m).
+
+    The latter is infinite where another zone of the first colour lies on the straight way to it.
+    """
+    robot, zones = layout.robot[:2], layout.zones[first]
+    near = _distance(zones, robot)
+    onward = _distance(zones[:, None], layout.zones[second]).min(-1)
+    beside = jax.vmap(lambda end: _distance_to_way(zones, robot, end))(zones)
+    over_another = ((beside < CLEARANCE) & ~jnp.eye(ZONES_EACH, dtype=bool)).any(-1)
+    return near, jnp.where(over_another, jnp.inf, near + onward)
 
 
 def _distance(left: Float[Array, "... 2"], right: Float[Array, "... 2"]) -> Float[Array, "..."]:

@@ -17,10 +17,19 @@ from flax import struct
 from jaxtyping import Bool, Float, Float32, Int32, Key, Shaped
 
 from envs_jax.arrays import Array
-from envs_jax.base import Box, ContestedChoice, Drawable, EnvParams, Reflections, StepResult, Symmetric
+from envs_jax.base import (
+    Box,
+    ContestedChoice,
+    ContestedLayouts,
+    Drawable,
+    EnvParams,
+    Reflections,
+    StepResult,
+    Symmetric,
+)
 from envs_jax.scenes import DiscScene, Region
 from envs_jax.zone import physics as zone_physics
-from envs_jax.zone.contested import contested_layout
+from envs_jax.zone.contested import LEAST_DETOUR, contested_layout, ways
 from envs_jax.zone.layouts import COLOURS, ZONES_EACH, ZoneLayout, new_layout
 from envs_jax.zone.physics import NUM_SENSORS, Backend, import_mjx
 
@@ -53,7 +62,7 @@ class ZoneState:
 
 
 @dataclasses.dataclass(frozen=True)
-class Zone(Symmetric, ContestedChoice, Drawable):
+class Zone(Symmetric, ContestedLayouts, ContestedChoice, Drawable):
     """The Zone world.
 
     Layout: a `ZoneLayout`, the robot's pose and two zones of each colour. Observation: float32 ``[80]``:
@@ -136,7 +145,6 @@ class Zone(Symmetric, ContestedChoice, Drawable):
         first: Bool[Array, " P"],
         second: Bool[Array, " P"],
         params: EnvParams,
-        mirrored: Bool[Array, ""] | bool = False,
     ) -> ZoneLayout:
         """A layout on which going to the nearest zone first makes the whole way longer. The key is consumed.
 
@@ -145,7 +153,6 @@ class Zone(Symmetric, ContestedChoice, Drawable):
             first: bool ``[P]``, the colour to reach first.
             second: bool ``[P]``, the colour to reach after it.
             params: of the environment.
-            mirrored: bool ``[]``, the control instead, where the nearest zone is the right one.
 
         Returns:
             A `envs_jax.zone.contested.contested_layout`, whose right zone of the first colour is number 0; where a
@@ -153,7 +160,7 @@ class Zone(Symmetric, ContestedChoice, Drawable):
         """
         wanted = (first.sum() == 1) & (second.sum() == 1) & ~(first & second).any()
         plain = self.resample_layout(key, _no_layout(), ~wanted, params)
-        contested = contested_layout(key, jnp.argmax(first), jnp.argmax(second), mirrored=mirrored, needed=wanted)
+        contested = contested_layout(key, jnp.argmax(first), jnp.argmax(second), needed=wanted)
         return jax.tree.map(lambda this, other: jnp.where(wanted, this, other), contested, plain)
 
     @functools.cached_property
@@ -192,6 +199,17 @@ class Zone(Symmetric, ContestedChoice, Drawable):
         """Colours to go to first and then that a contested layout can be about: the first leaves the second there."""
         names = itertools.permutations(COLOURS, 2)
         return tuple((COLOURS.index(a), COLOURS.index(b)) for a, b in names if (a, b) not in self.vanishing)
+
+    @property
+    def least_detour(self) -> float:
+        """Half a metre."""
+        return LEAST_DETOUR
+
+    def ways(
+        self, layout: ZoneLayout, first: Bool[Array, " P"], second: Bool[Array, " P"]
+    ) -> tuple[Float32[Array, " I"], Float32[Array, " I"]]:
+        """See `envs_jax.zone.contested.ways`."""
+        return ways(layout, jnp.argmax(first), jnp.argmax(second))
 
     def instance_at(self, state: ZoneState, goal: Bool[Array, " P"]) -> Int32[Array, ""]:
         """Which zone of a colour (``goal``, one-hot bool ``[P]``) the robot is nearest to, int32 ``[]``."""

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 
-from hrlspec.presets import Recipe, RewardSet
+from hrlspec.presets import Recipe, RewardSet, Split
 
 RECIPES: tuple[Recipe, ...] = ("paper", "hrlspec")
 ENVIRONMENTS = ("letter", "walk", "zone")
 BUDGETS = {"letter": 1_500_000, "walk": 2_000_000, "zone": 4_000_000}
 """Environment steps of a run."""
 NUM_SEEDS = 5
+FIRST_DEVELOPMENT_SEED = 100
+"""Seeds from here on are for tuning."""
 POINTS = 20
 """Evaluations along a curve."""
 _OPTIMISER = "config.low.optimiser."
@@ -57,6 +59,11 @@ class Run:
         return f"{self.env}-{self.curve.method}-{self.curve.recipe}-set{self.reward_set}{switches}-seed{self.seed}"
 
     @property
+    def split(self) -> Split:
+        """Whose results are reported is tested; whose are only looked at to choose something is validated."""
+        return "test" if self.seed < FIRST_DEVELOPMENT_SEED else "validation"
+
+    @property
     def flags(self) -> list[str]:
         """The flags of ``experiments.run`` that make it, without those that say where."""
         curve = self.curve
@@ -68,6 +75,7 @@ class Run:
             "seed": self.seed,
             "total-steps": self.total_steps,
             "evaluation.every": max(1, self.total_steps // POINTS),
+            "evaluation.final": self.split,
         }
         return [part for name, value in flags.items() for part in (f"--{name}", str(value))] + list(curve.switches)
 
@@ -158,7 +166,9 @@ def _trials(env: str) -> tuple[Curve, ...]:
 
 
 TUNING = {
-    f"{env}-tuning": Panel(f"{env}-tuning", f"{env.capitalize()}, tuning", env, 2, _trials(env), first_seed=100)
+    f"{env}-tuning": Panel(
+        f"{env}-tuning", f"{env.capitalize()}, tuning", env, 2, _trials(env), first_seed=FIRST_DEVELOPMENT_SEED
+    )
     for env in ENVIRONMENTS
 }
 """What the learning rates in ``presets.py`` were chosen by: one run each, with a seed that no panel uses."""

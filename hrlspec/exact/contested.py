@@ -1,7 +1,7 @@
 """Contested choices: layouts where going to the nearest goal first costs steps later.
 
 The tasks are two sub-tasks in sequence, ``achieve a; achieve b``. Where the total path through the nearest a is longer
-than another, only an agent that looks ahead chooses the other; in the mirrored controls the nearest a is optimal.
+than another, only an agent that looks ahead chooses the other; in the controls the nearest a is optimal.
 
 Axes: **L** layouts, **S** graph states, **P** atomic propositions, **Q** cases of a suite.
 """
@@ -163,9 +163,9 @@ def contested_suite(
 ) -> ContestedSuite:
     """Contested layouts of an environment, and as many controls.
 
-    Tasks go through all ordered pairs of different propositions in turn. In finite environments the layouts are those
-    of :meth:`envs_jax.Environment.sample_layout`, kept by :func:`find_contested` and for no other reason, so that the
-    suite is a random sample of such layouts. Elsewhere the environment draws them so that they are contested.
+    Tasks go through all ordered pairs of different propositions in turn. The layouts are those of
+    :meth:`envs_jax.Environment.sample_layout`, kept because they are contested, or controls, and for no other reason:
+    the suite is a random sample of such layouts, and owes nothing to those that are made to be trained on.
 
     Args:
         key: consumed.
@@ -185,7 +185,7 @@ def contested_suite(
     if isinstance(env, FiniteGraph):
         return _found_suite(key, env, num_cases // 2, margin, most_rounds)
     if isinstance(env, ContestedChoice):
-        return _drawn_suite(key, env, num_cases // 2)
+        return _measured_suite(key, env, num_cases // 2, most_rounds)
     raise _not_contestable(env)
 
 
@@ -226,45 +226,55 @@ def _found_suite(key: Key[Array, ""], env: FiniteGraph, wanted: int, margin: int
                     layout = jax.tree.map(lambda leaf, at=part[i]: leaf[at], layouts)
                     kept[kind].append((layout, tree, kind, found.right[i], found.nearest[i], found.optimum[i]))
         if min(len(kept[True]), len(kept[False])) >= wanted:
-            cases = kept[True][:wanted] + kept[False][:wanted]
-            layouts, tasks = (
-                jax.tree.map(lambda *leaves: np.stack(leaves), *[case[i] for case in cases]) for i in (0, 1)
-            )
-            return ContestedSuite(layouts, tasks, *(np.stack([case[i] for case in cases]) for i in range(2, 6)))
-    found_so_far = f"{len(kept[True])} contested and {len(kept[False])} control cases"
-    raise ValueError(f"{env.name}: only {found_so_far} in {512 * most_rounds} layouts, {wanted} of each are wanted")
+            return _suite_of(kept, wanted)
+    raise _too_few(env, kept, most_rounds, wanted)
 
 
-def _drawn_suite(key: Key[Array, ""], env: ContestedChoice, wanted: int) -> ContestedSuite:
-    """Contested layouts and, with the same keys, their mirrored controls; instance 0 is optimal in both."""
-    pairs = itertools.islice(itertools.cycle(env.contested_pairs), wanted)
-    trees = [two_step_task(first, second, env.num_propositions) for first, second in pairs]
-    tasks: TaskTree = jax.tree.map(lambda *leaves: np.stack(leaves * 2), *trees)
-    case = np.arange(2 * wanted)
-    contested = case < wanted
-    keys = jax.random.split(key, wanted)[case % wanted]
-    layouts = _contested_layouts(env, keys, tasks.reach[:, 1], tasks.reach[:, 2], ~contested)
-    return ContestedSuite(
-        layouts=jax.tree.map(np.asarray, layouts),
-        tasks=tasks,
-        contested=contested,
-        right=np.tile(np.array([True, False]), (2 * wanted, 1)),
-        nearest=contested.astype(np.int64),
-        optimum=np.full(2 * wanted, np.nan, np.float32),
-    )
+def _measured_suite(key: Key[Array, ""], env: ContestedChoice, wanted: int, most_rounds: int) -> ContestedSuite:
+    """Random layouts until in ``wanted`` the way over the nearest instance is longer, and in as many shorter."""
+    pairs = np.array(env.contested_pairs)
+    eye = np.eye(env.num_propositions, dtype=bool)
+    kept: dict[bool, list[tuple[Any, ...]]] = {True: [], False: []}
+    for number, draw_key in enumerate(jax.random.split(key, most_rounds)):
+        layouts = _sample_layouts(env, jax.random.split(draw_key, 512))
+        first, second = pairs[(512 * number + np.arange(512)) % len(pairs)].T
+        near, whole = map(np.asarray, _ways(env, layouts, eye[first], eye[second]))
+        nearest, rows = near.argmin(-1), np.arange(512)
+        over_nearest = whole[rows, nearest]
+        others = np.where(nearest[:, None] == np.arange(near.shape[1]), np.inf, whole).min(-1)
+        flags = {
+            True: over_nearest >= others + env.least_detour,
+            False: np.isfinite(others) & (others >= over_nearest + env.least_detour),
+        }
+        for kind, found in flags.items():
+            for i in np.flatnonzero(found & np.isfinite(over_nearest)):
+                layout = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], layouts)
+                tree = two_step_task(int(first[i]), int(second[i]), env.num_propositions)
+                right = whole[i] == whole[i].min()
+                kept[kind].append((layout, tree, kind, right, nearest[i], np.float32(np.nan)))
+        if min(len(kept[True]), len(kept[False])) >= wanted:
+            return _suite_of(kept, wanted)
+    raise _too_few(env, kept, most_rounds, wanted)
+
+
+def _suite_of(kept: dict[bool, list[tuple[Any, ...]]], wanted: int) -> ContestedSuite:
+    """So many contested cases, and as many controls."""
+    cases = kept[True][:wanted] + kept[False][:wanted]
+    layouts, tasks = (jax.tree.map(lambda *leaves: np.stack(leaves), *[case[i] for case in cases]) for i in (0, 1))
+    return ContestedSuite(layouts, tasks, *(np.stack([case[i] for case in cases]) for i in range(2, 6)))
+
+
+def _too_few(env: Environment, kept: dict[bool, list[tuple[Any, ...]]], rounds: int, wanted: int) -> ValueError:
+    found = f"{len(kept[True])} contested and {len(kept[False])} control cases"
+    return ValueError(f"{env.name}: only {found} in {512 * rounds} layouts, {wanted} of each are wanted")
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _contested_layouts(
-    env: ContestedChoice,
-    keys: Key[Array, " Q"],
-    first: Bool[Array, "Q P"],
-    second: Bool[Array, "Q P"],
-    mirrored: Bool[Array, " Q"],
-) -> Layout:
-    """One layout for each key."""
-    draw = functools.partial(env.contested_layout, params=env.default_params)
-    return jax.vmap(lambda key, one, other, flag: draw(key, one, other, mirrored=flag))(keys, first, second, mirrored)
+def _ways(
+    env: ContestedChoice, layouts: Layout, first: Bool[Array, "Q P"], second: Bool[Array, "Q P"]
+) -> tuple[Float32[Array, "Q I"], Float32[Array, "Q I"]]:
+    """`ContestedChoice.ways` in each layout."""
+    return jax.vmap(env.ways)(layouts, first, second)
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from hrlspec.presets.generic import preset_for
 from hrlspec.presets.letter import LETTER, LETTER12
-from hrlspec.presets.preset import Preset
+from hrlspec.presets.preset import Preset, Split
 from hrlspec.presets.recipes import RECIPES, Recipe, RewardSet
 from hrlspec.presets.walk import FLATWORLD, WALK
 from hrlspec.presets.zone import ZONE, ZONE_LTL2ACTION, ZONE_NM
 
-__all__ = ["PRESETS", "RECIPES", "Preset", "Recipe", "RewardSet", "preset", "preset_for"]
+__all__ = ["PRESETS", "RECIPES", "Preset", "Recipe", "RewardSet", "Split", "preset", "preset_for"]
 
 PRESETS: dict[str, Preset] = {
     some.name: some for some in (LETTER, LETTER12, WALK, FLATWORLD, ZONE, ZONE_LTL2ACTION, ZONE_NM)

@@ -13,7 +13,7 @@ from hrlspec.evaluation.cases import LAYOUTS_PER_TASK, draw_layouts, task_of
 from hrlspec.exact.steps import step_solver
 from hrlspec.presets.preset import Preset
 from hrlspec.presets.recipes import Recipe, Settings, continuous
-from hrlspec.presets.suite_rules import DAG, draw_suite, seed_of_suite
+from hrlspec.presets.suite_rules import DAG, draw_suite, seed_of_suite, with_validation
 from hrlspec.presets.suites import commented
 
 WIDE = 64
@@ -60,26 +60,32 @@ def preset_for(env: Environment) -> Preset:
     return Preset(env.name, lambda: env, fit, compiled_with="least")
 
 
-def unseen_tasks(env: Environment, seed: int) -> str:
-    """Text of a test suite: random trees like those of the other worlds' suites ``dag``.
+def unseen_tasks(env: Environment, seed: int) -> dict[str, str]:
+    """Texts of a test suite and a validation suite by name: random trees like those of the other worlds' ``dag``.
 
     200 tasks of depth 2, 3 and 4; fewer where P is so small that there are few, of each depth at most a quarter of
     those there are. Tasks of one sub-task are never among them. With one proposition there is only one task, which
-    cannot be kept from training: the suite is that task. Where there is an exact solver, tasks that can rarely be
+    cannot be kept from training: both suites are that task. Where there is an exact solver, tasks that can rarely be
     satisfied within the horizon are left out.
 
     Raises:
         ValueError: no task is left.
     """
-    (first, *others), where = env.propositions, f"{env.name}/dag"
-    if not others:
-        return commented([f"{where}: the only task there is, and so not unseen"], [f"achieve {first}"])
-    rule = dataclasses.replace(DAG, scarce=True)
-    rng = np.random.default_rng([seed, seed_of_suite(env.name, "dag")])
-    trees = draw_suite(rng, rule, env.num_propositions, np.zeros(0, np.uint32), where)
-    suite = _possible(env, suite_from_trees("dag", trees, env.propositions))
-    about = f"{rule.about}; fewer of a depth where there are few"
-    return commented([f"{where}: {len(suite)} unseen tasks, drawn with seed {seed}", about], suite.formulas)
+    (first, *others), rule = env.propositions, dataclasses.replace(DAG, scarce=True)
+    texts, taken = {}, np.zeros(0, np.uint32)
+    for name in with_validation({"dag": rule}):
+        where = f"{env.name}/{name}"
+        if not others:
+            texts[name] = commented([f"{where}: the only task there is, and so not unseen"], [f"achieve {first}"])
+            continue
+        rng = np.random.default_rng([seed, seed_of_suite(env.name, name)])
+        trees = draw_suite(rng, rule, env.num_propositions, taken, where)
+        suite = _possible(env, suite_from_trees(name, trees, env.propositions))
+        about = f"{rule.about}; fewer of a depth where there are few"
+        comments = [f"{where}: {len(suite)} unseen tasks, drawn with seed {seed}", about]
+        texts[name] = commented(comments, suite.formulas)
+        taken = suite.hashes
+    return texts
 
 
 def _possible(env: Environment, suite: Suite) -> Suite:

@@ -16,6 +16,7 @@ from hrlspec.presets.suite_rules import (
     sequences,
     shortest,
     trees,
+    with_validation,
 )
 from hrlspec.tasks.rewards import Bonus
 
@@ -87,7 +88,7 @@ LETTER = Preset(
     letter_with_bonuses,
     bonuses=_BONUSES,
     learning_rates=_LEARNING_RATES,
-    suites=_SUITES,
+    suites=with_validation(_SUITES),
     compiled_with="least",
 )
 LETTER12 = Preset(
@@ -96,6 +97,6 @@ LETTER12 = Preset(
     _twelve,
     letter_with_bonuses,
     bonuses=_BONUSES,
-    suites=_SUITES12,
+    suites=with_validation(_SUITES12),
     compiled_with="least",
 )

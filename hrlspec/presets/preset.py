@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
+from typing import Literal
 
 import numpy as np
 
@@ -14,10 +15,12 @@ from hrlspec.config import Config, Effort, evolve
 from hrlspec.evaluation import Suite, suite_from_text
 from hrlspec.methods import METHODS, ImplicitPlanner
 from hrlspec.presets.recipes import Recipe, RewardSet, Settings, recipe, with_bonuses
-from hrlspec.presets.suite_rules import SuiteRule
+from hrlspec.presets.suite_rules import VALIDATION, SuiteRule
 from hrlspec.presets.suites import SuiteError, hashes_of, packaged_hashes, packaged_suite
 from hrlspec.tasks.rewards import Bonus, RewardMachine, reward_machine
 
+Split = Literal["validation", "test"]
+"""Tasks and layouts for whoever tunes or chooses anything, and those that are left to the end."""
 Fit = Callable[[Settings, Recipe], Settings]
 
 
@@ -97,6 +100,15 @@ class Preset:
     def suite_names(self) -> tuple[str, ...]:
         """The test suites; none for a world that nobody drew any for."""
         return (*self.suites, *self.texts)
+
+    def suite_for(self, split: Split, name: str = "dag") -> Suite:
+        """A test suite, or its counterpart for validation; a world without the latter is validated on the former.
+
+        Raises:
+            SuiteError: there is none, or its file cannot be read.
+        """
+        other = name + VALIDATION
+        return self.suite(other if split == "validation" and other in self.suite_names else name)
 
     def suite(self, name: str) -> Suite:
         """A test suite by its name.

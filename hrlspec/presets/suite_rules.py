@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import jax
 import numpy as np
@@ -118,9 +118,21 @@ REACH = SuiteRule(
 )
 
 
+VALIDATION = "_validation"
+"""Ending of the names of suites for whoever tunes or chooses anything, which leaves the test suites to the end."""
+_VALIDATED = ("dag", "branches")
+_DRAWING = 2
+"""Which drawing of all suites this is: the first served for tuning and for results alike."""
+
+
+def with_validation(rules: Mapping[str, SuiteRule]) -> dict[str, SuiteRule]:
+    """Rules of test suites and, last, of the validation suites that belong to some of them."""
+    return {**rules, **{name + VALIDATION: rules[name] for name in _VALIDATED if name in rules}}
+
+
 def seed_of_suite(world: str, name: str) -> int:
     """A number that belongs to the suite's name, so that adding a suite changes no other."""
-    return zlib.crc32(f"{world}/{name}".encode())
+    return zlib.crc32(f"{world}/{name}/{_DRAWING}".encode())
 
 
 def draw_suite(

@@ -7,7 +7,7 @@ import functools
 import envs_jax
 from hrlspec.presets.preset import Preset
 from hrlspec.presets.recipes import Recipe, Settings, continuous
-from hrlspec.presets.suite_rules import DAG, REACH, REACH_AVOID
+from hrlspec.presets.suite_rules import DAG, REACH, REACH_AVOID, with_validation
 from hrlspec.tasks.rewards import Bonus
 
 
@@ -54,7 +54,7 @@ def walk_with_bonuses(settings: Settings, recipe: Recipe) -> Settings:
     )
 
 
-_SUITES = {"dag": DAG, "reach_avoid": REACH_AVOID, "reach": REACH}
+_SUITES = with_validation({"dag": DAG, "reach_avoid": REACH_AVOID, "reach": REACH})
 
 WALK = Preset(
     "walk",

@@ -12,7 +12,16 @@ import envs_jax
 from envs_jax.zone.layouts import COLOURS
 from hrlspec.presets.preset import Preset
 from hrlspec.presets.recipes import Recipe, Settings, continuous, once, twice
-from hrlspec.presets.suite_rules import NUM_TASKS, REACH, REACH_AVOID, SuiteRule, random_trees, shortest, trees
+from hrlspec.presets.suite_rules import (
+    NUM_TASKS,
+    REACH,
+    REACH_AVOID,
+    SuiteRule,
+    random_trees,
+    shortest,
+    trees,
+    with_validation,
+)
 from hrlspec.spec import TaskTree
 from hrlspec.tasks.rewards import Bonus
 
@@ -117,7 +126,7 @@ def _preset(name: str, suites: Mapping[str, SuiteRule]) -> Preset:
         zone_with_bonuses,
         bonuses=_BONUSES,
         learning_rates=_LEARNING_RATES,
-        suites=suites,
+        suites=with_validation(suites),
     )
 
 

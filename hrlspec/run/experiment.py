@@ -11,7 +11,7 @@ from typing import Any, Literal
 from hrlspec.agent.agent import Agent
 from hrlspec.config import Checked, Config, ConfigError, setting
 from hrlspec.methods import Method
-from hrlspec.presets import Preset, Recipe, RewardSet
+from hrlspec.presets import Preset, Recipe, RewardSet, Split
 from hrlspec.run.errors import UserError
 from hrlspec.run.lookup import method_named, preset_named
 from hrlspec.tasks.rewards import RewardMachine
@@ -25,8 +25,11 @@ class EvaluationConfig(Checked):
     """Environment steps between evaluations during training."""
     episodes: int = setting(100, least=10, most=1_000_000)
     """Episodes of an evaluation during training, spread over 10 unseen tasks."""
+    final: Split = "validation"
+    """Tasks and layouts of the evaluation at the end. Those of the learning curve are always validation's; test is for
+    agents of which nothing will be chosen afterwards."""
     final_tasks: int = setting(200, least=1)
-    """Unseen tasks of the evaluation at the end, at most as many as the test suite has; 10 layouts for each."""
+    """Unseen tasks of the evaluation at the end, at most as many as the suite has; 10 layouts for each."""
     contested: int = setting(400, least=0, most=100_000)
     """Layouts of the contested-choice suite at the end; 0 leaves it out."""
     greedy: bool = False

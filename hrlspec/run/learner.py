@@ -28,7 +28,7 @@ from hrlspec.evaluation import (
 )
 from hrlspec.exact.contested import Contestable
 from hrlspec.learning.train import Trainer, TrainState
-from hrlspec.presets import Preset
+from hrlspec.presets import Preset, Split
 from hrlspec.run.errors import UserError
 from hrlspec.run.experiment import Experiment
 from hrlspec.run.loop import Job
@@ -36,6 +36,8 @@ from hrlspec.run.programs import Program
 from hrlspec.tasks.bank import TaskBanks
 
 PERIODIC_TASKS = (1, 2, 5, 10)  # the most there are; each divides the number of episodes
+_LAYOUTS: dict[Split, int] = {"validation": 1, "test": 2}
+"""Seeds of the layouts at the end; the learning curve's have another one."""
 _EVALUATION_STREAM, _FINAL_STREAM = 1, 2  # of random numbers, apart from training's
 
 
@@ -111,33 +113,38 @@ class Learner:
         settings = self.experiment.evaluation
         keys = jax.random.split(self._key(_FINAL_STREAM), 3)
         how = self.agent, params, self.machine
-        suite = self.test_suite.take(_spread(len(self.test_suite), settings.final_tasks))
-        result = final_evaluation(self.env, suite, episodes=len(suite), greedy=settings.greedy)(keys[0], *how)
+        where: dict[str, Any] = {"seed": _LAYOUTS[settings.final], "greedy": settings.greedy}
+        suite = self._some("dag")
+        result = final_evaluation(self.env, suite, episodes=len(suite), **where)(keys[0], *how)
         choice = returns = first = None
         if self.agent.method.sees != "whole task":
             # There may be no such case, or nothing by which to tell what is best.
             with contextlib.suppress(ValueError):
-                evaluation = first_choice_evaluation(self.env, suite, self.machine, greedy=settings.greedy)
+                evaluation = first_choice_evaluation(self.env, suite, self.machine, **where)
                 first = evaluation(jax.random.fold_in(self._key(_FINAL_STREAM), 3), *how)
         if settings.contested and isinstance(self.env, Contestable):
             # An environment of somebody else's may be of that kind and yet have hardly any such layout.
             with contextlib.suppress(ValueError):
-                contested = choice_evaluation(self.env, num_cases=settings.contested, greedy=settings.greedy)
+                contested = choice_evaluation(self.env, num_cases=settings.contested, **where)
                 choice = contested(keys[1], *how)
         if self.experiment.reward_set == 2 and "branches" in self.preset.suite_names:
-            branches = self.preset.suite("branches")
-            branches = branches.take(_spread(len(branches), settings.final_tasks))
-            returns = return_evaluation(self.env, branches, self.machine, greedy=settings.greedy)(keys[2], *how)
+            returns = return_evaluation(self.env, self._some("branches"), self.machine, **where)(keys[2], *how)
         return FinalResults(result, choice, returns, first)
 
     @functools.cached_property
-    def test_suite(self) -> Suite:
-        """Unseen tasks."""
-        return self.preset.suite("dag")
+    def validation_suite(self) -> Suite:
+        """Unseen tasks, on which learning is watched."""
+        return self.preset.suite_for("validation")
+
+    def _some(self, name: str) -> Suite:
+        """As many tasks of a suite as the evaluation at the end asks for, evenly spread."""
+        settings = self.experiment.evaluation
+        suite = self.preset.suite_for(settings.final, name)
+        return suite.take(_spread(len(suite), settings.final_tasks))
 
     @functools.cached_property
     def _periodic(self) -> SuiteEvaluation:
-        settings, suite = self.experiment.evaluation, self.test_suite
+        settings, suite = self.experiment.evaluation, self.validation_suite
         num_tasks = max(number for number in PERIODIC_TASKS if number <= len(suite))
         return periodic_evaluation(
             self.env, suite, num_tasks=num_tasks, episodes=settings.episodes, greedy=settings.greedy

@@ -1,4 +1,4 @@
-"""Test tasks of a run: its preset's suites, or, for an environment that has none, tasks drawn for the run."""
+"""Test tasks of a run: its preset's suites, or, for an environment without any, tasks drawn for the run."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from hrlspec.run.errors import UserError
 
 
 def with_tasks(preset: Preset, folder: Path, seed: int) -> Preset:
-    """The preset, with a suite ``dag`` if it has none: the one in the run folder, or one drawn with the run's seed.
+    """The preset, with suites if it has none: those in the run folder, or some drawn with the run's seed.
 
     Raises:
         UserError: the run folder's suite cannot be read.
     """
     if preset.suite_names:
         return preset
-    file = folder / "tasks" / "dag.txt"
+    tasks = folder / "tasks"
     try:
-        text = file.read_text(encoding="utf-8") if file.exists() else unseen_tasks(preset.make(), seed)
+        found = {file.stem: file.read_text(encoding="utf-8") for file in sorted(tasks.glob("*.txt"))}
+        texts = found or unseen_tasks(preset.make(), seed)
     except OSError as error:
-        raise UserError(f"cannot read {file}: {error}") from error
+        raise UserError(f"cannot read {tasks}: {error}") from error
     except ValueError as error:  # no text, or no task that can be satisfied
-        raise UserError(f"no test tasks in {file}: {error}") from error
-    return dataclasses.replace(preset, texts={"dag": text})
+        raise UserError(f"no test tasks in {tasks}: {error}") from error
+    return dataclasses.replace(preset, texts=texts)

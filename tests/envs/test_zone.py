@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 import envs_jax
-from envs_jax.zone.contested import contested_layout
+from envs_jax.zone.contested import contested_layout, ways
 from envs_jax.zone.layouts import ZoneLayout
 from envs_jax.zone.world import BOUNDARY, PRESETS, Zone
 
@@ -170,24 +170,19 @@ def test_touching_blue_makes_green_vanish() -> None:
 
 
 @functools.cache
-def contested_layouts(number: int = 256) -> tuple[np.ndarray, np.ndarray, tuple[ZoneLayout, ZoneLayout]]:
-    """First and second colours ``[number]``, the layouts and their controls."""
+def contested_layouts(number: int = 256) -> tuple[np.ndarray, np.ndarray, ZoneLayout]:
+    """First and second colours ``[number]``, and the layouts."""
     rng = np.random.default_rng(0)
     first = rng.integers(4, size=number)
     second = (first + rng.integers(1, 4, size=number)) % 4
-
-    @jax.jit
-    def draw(mirrored: bool) -> ZoneLayout:
-        one = functools.partial(contested_layout, mirrored=mirrored)
-        return jax.vmap(one)(jax.random.split(jax.random.key(0), number), jnp.asarray(first), jnp.asarray(second))
-
-    return first, second, tuple(jax.tree.map(np.asarray, draw(mirrored)) for mirrored in (False, True))
+    draw = jax.jit(jax.vmap(contested_layout))
+    layouts = draw(jax.random.split(jax.random.key(0), number), jnp.asarray(first), jnp.asarray(second))
+    return first, second, jax.tree.map(np.asarray, layouts)
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
-def test_contested_layouts(mirrored: bool) -> None:
-    first, second, both = contested_layouts()
-    drawn, number = both[mirrored], len(first)
+def test_contested_layouts() -> None:
+    first, second, drawn = contested_layouts()
+    number = len(first)
     robot, index = drawn.robot[:, :2], np.arange(number)
     better, other = drawn.zones[index, first, 0], drawn.zones[index, first, 1]
     goals = drawn.zones[index, second]
@@ -198,10 +193,9 @@ def test_contested_layouts(mirrored: bool) -> None:
 
     assert np.abs(robot).max() <= 0.3
     assert ((distance(robot, goal) > 1.8 - 1e-5) & (distance(robot, goal) < 2.4 + 1e-5)).all()
-    near, far = (better, other) if mirrored else (other, better)
-    assert (distance(robot, near) + 0.0999 <= distance(robot, far)).all()
-    assert ((distance(robot, near) > 0.8 - 1e-5) & (distance(robot, near) < 1.2 + 1e-5)).all()
-    share = distance(robot, far) / distance(robot, goal)
+    assert (distance(robot, other) + 0.0999 <= distance(robot, better)).all()
+    assert ((distance(robot, other) > 0.8 - 1e-5) & (distance(robot, other) < 1.2 + 1e-5)).all()
+    share = distance(robot, better) / distance(robot, goal)
     assert ((share > 0.5 - 1e-5) & (share < 0.7 + 1e-5)).all()
     # One on the goal's side, one opposite.
     sides = [((zone - robot) * (goal - robot)).sum(-1) > 0 for zone in (better, other)]
@@ -224,13 +218,19 @@ def test_contested_layouts(mirrored: bool) -> None:
     assert stats.kstest(drawn.robot[:, 2], stats.uniform(0, 2 * np.pi).cdf).pvalue > 1e-4
 
 
-def test_controls_are_the_same_layouts_with_the_first_colour_reflected() -> None:
-    first, _, (plain, control) = contested_layouts()
-    np.testing.assert_array_equal(plain.robot, control.robot)
-    others = np.arange(4) != first[:, None]
-    np.testing.assert_array_equal(plain.zones[others], control.zones[others])
-    reflected = 2 * plain.robot[:, None, :2] - plain.zones[~others][:, ::-1]
-    np.testing.assert_allclose(reflected, control.zones[~others], atol=1e-6)
+def test_ways_in_contested_layouts_and_in_all_others() -> None:
+    """Straight lines; a contested layout's better zone is its first. One behind another cannot be gone to first."""
+    first, second, drawn = contested_layouts()
+    near, whole = map(np.asarray, jax.jit(jax.vmap(ways))(drawn, jnp.asarray(first), jnp.asarray(second)))
+    assert (near[:, 1] < near[:, 0]).all()
+    assert (whole[:, 0] + 0.4999 <= whole[:, 1]).all()
+    zones = np.full((4, 2, 2), 9.0)
+    zones[BLUE], zones[GREEN] = [[1, 0], [-2, 0]], [[-3, 0], [0, 4]]
+    near, whole = ways(ZoneLayout(robot=np.zeros(3), zones=jnp.asarray(zones)), BLUE, GREEN)
+    np.testing.assert_allclose(near, [1, 2])
+    np.testing.assert_allclose(whole, [1 + 4, 2 + 1])
+    zones[BLUE] = [[1, 0], [2, 0.1]]
+    assert ways(ZoneLayout(robot=np.zeros(3), zones=jnp.asarray(zones)), BLUE, GREEN)[1][1] == np.inf
 
 
 def test_contested_where_two_colours_are_given() -> None:

@@ -35,7 +35,7 @@ def named(*names: str, horizon: int = 100) -> Any:
 
 
 def suite_of(env: Any, seed: int = 0) -> Suite:
-    return suite_from_text("dag", unseen_tasks(env, seed), env.propositions)
+    return suite_from_text("dag", unseen_tasks(env, seed)["dag"], env.propositions)
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
@@ -64,7 +64,7 @@ def test_networks_fit_what_is_seen(env: Any, recipe: Any) -> None:
 @pytest.mark.parametrize("number", [1, 2, 3, 4])
 def test_whatever_is_held_out_every_level_can_be_drawn(number: int) -> None:
     env = named(*"abcd"[:number])
-    some = dataclasses.replace(preset_for(env), texts={"dag": unseen_tasks(env, 3)})
+    some = dataclasses.replace(preset_for(env), texts=unseen_tasks(env, 3))
     for recipe in RECIPES:
         config, _ = some.settings("ours", recipe)
         bank = TaskBanks(0, config.curriculum, number, some.reserved).at(0)
@@ -98,10 +98,19 @@ def test_with_two_at_most_a_quarter_of_what_there_is() -> None:
 
 def test_with_one_the_only_task_is_not_held_out() -> None:
     env = named("goal")
-    text = unseen_tasks(env, 0)
-    assert text == "# bare letter/dag: the only task there is, and so not unseen\nachieve goal\n"
-    assert dataclasses.replace(preset_for(env), texts={"dag": text}).reserved.shape == (0,)
+    texts = unseen_tasks(env, 0)
+    for name in ("dag", "dag_validation"):
+        assert texts[name] == f"# bare letter/{name}: the only task there is, and so not unseen\nachieve goal\n"
+    assert dataclasses.replace(preset_for(env), texts=texts).reserved.shape == (0,)
     assert preset_for(env).settings("ours")[0].curriculum.levels == 1
+
+
+def test_validation_and_test_share_no_task() -> None:
+    env = named(*"abcde")
+    texts = unseen_tasks(env, 0)
+    one, other = (suite_from_text(name, texts[name], env.propositions) for name in ("dag", "dag_validation"))
+    assert (len(one), len(other)) == (200, 200)
+    assert not np.isin(one.hashes, other.hashes).any()
 
 
 def test_tasks_follow_the_seed() -> None:

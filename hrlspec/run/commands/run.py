@@ -205,6 +205,6 @@ def _draw(learner: Learner, run: RunFolder, params: Any) -> Iterator[Path]:
             learner.agent,
             params,
             learner.machine,
-            learner.test_suite,
+            learner.validation_suite,
             run.plots,
         )
