@@ -63,6 +63,8 @@ class LTL2Action(Method):
         """Without a sub-task there are no roles to encode the observation by, and no avoid set for the shield."""
         network = dataclasses.replace(
             config.network,
+            # Images are not seen by role, which is what makes convolutions superfluous.
+            conv_channels=NetworkConfig.conv_channels,
             # The only features of the task that it is conditioned on.
             task_features=NetworkConfig.task_features,
             task_rounds=0,

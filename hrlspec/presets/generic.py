@@ -35,8 +35,7 @@ def preset_for(env: Environment) -> Preset:
     """Letter's settings for discrete actions, those of small steps for continuous ones, fitted to the environment.
 
     Of its horizon H: the discount, 1 - 3 / H, within 0.9 and 0.998. Of its P propositions: no levels above the first
-    where there is one alone, and at most P - 2 propositions to avoid. Of its view: the latent's width, and for images
-    no more 2x2 convolutions than fit.
+    where there is one alone, and at most P - 2 propositions to avoid. Of its view: the latent's width.
     """
 
     def fit(settings: Settings, recipe: Recipe) -> Settings:
@@ -46,12 +45,11 @@ def preset_for(env: Environment) -> Preset:
             settings = continuous(settings, learning_rate=1e-3).evolve(_FAR_GOALS)
         config = settings.config
         view = jax.eval_shape(env.proposition_view, jax.ShapeDtypeStruct(env.observation_shape, "float32"))
-        numbers, side = sum(part.size for part in view), min(view[0].shape[1:], default=1)
+        numbers = sum(part.size for part in view)
         return settings.evolve(
             {
                 "config.discount": min(max(1 - 3 / env.horizon, 0.9), 0.998),
                 "config.network.latent": config.network.latent * (2 if box and numbers > WIDE else 1),
-                "config.network.conv_channels": config.network.conv_channels[: side - 1],
                 "config.curriculum.levels": config.curriculum.levels if env.num_propositions > 1 else 1,
                 "config.curriculum.max_avoid": max(0, min(config.curriculum.max_avoid, env.num_propositions - 2)),
             }

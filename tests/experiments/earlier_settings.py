@@ -74,6 +74,8 @@ BEFORE = {
     "config.low.optimiser.epochs": (2,),
     "config.low.optimiser.minibatches": (16,),
     "config.low.value_coefficient": (0.5,),
+    # LTL2Action had none under recipe hrlspec.
+    "config.network.conv_channels": ([],),
     f"{_PLANNER}.steps_per_sample": (64,),
 }
 """What has been changed for speed since the records were made, and what they say of it. The page of results tells."""

@@ -53,12 +53,15 @@ def test_settings_by_spaces(env: Any, recipe: Any) -> None:
 @pytest.mark.parametrize("recipe", RECIPES)
 @pytest.mark.parametrize("env", [Letter(), Letter(size=3, num_letters=2, num_cells=2), Rooms(), Corridor(), Walk()])
 def test_networks_fit_what_is_seen(env: Any, recipe: Any) -> None:
-    """Images of any size; a convolution of 2x2 takes a row and a column."""
-    config, method = preset_for(env).settings("ours", recipe)
-    params = jax.eval_shape(Agent(env, config, method).init, jax.random.key(0))
-    assert all(leaf.size for leaf in jax.tree.leaves(params))
-    if recipe == "paper" and len(env.observation_shape) == 3:
-        assert len(config.network.conv_channels) == min(3, min(env.observation_shape[1:]) - 1)
+    """Images of any size; a convolution of 2x2 takes a row and a column. The flat policy's are never seen by role."""
+    for name in ("ours", "ltl2action"):
+        config, method = preset_for(env).settings(name, recipe)
+        params = jax.eval_shape(Agent(env, config, method).init, jax.random.key(0))
+        assert all(leaf.size for leaf in jax.tree.leaves(params))
+        leaves = jax.tree_util.tree_flatten_with_path(params["low"])[0]
+        convolutions = sum("conv_" in str(path) and "bias" not in str(path) for path, _ in leaves)
+        of_image = min(3, min(env.observation_shape[1:]) - 1) if len(env.observation_shape) == 3 else 0
+        assert convolutions == (0 if recipe == "hrlspec" and name == "ours" else of_image)
 
 
 @pytest.mark.parametrize("number", [1, 2, 3, 4])

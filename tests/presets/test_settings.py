@@ -126,6 +126,7 @@ def test_what_distinguishes_the_methods(name: str, recipe: Recipe) -> None:
         flat, method = preset(name).settings("ltl2action", recipe, reward_set)
         network = flat.network
         assert not any((network.roles, network.names, network.symmetric, network.memory, flat.shield.enabled))
+        assert network.conv_channels == (16, 32, 64)
         assert (network.task_features, network.task_rounds, method.sees) == (32, 0, "whole task")
         assert method.high.ppo is None
         option, method = preset(name).settings("option", recipe, reward_set)

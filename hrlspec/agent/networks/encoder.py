@@ -111,7 +111,8 @@ class Encoder(nn.Module):
 
     Attributes:
         latent: width of the output.
-        conv_channels: channels of the 2x2 convolutions, stride 1; none treats an image as a vector.
+        conv_channels: channels of the 2x2 convolutions, stride 1, of which a small image has no more than fit; none
+            treats an image as a vector.
         mlp: hidden units for vectors.
     """
 
@@ -130,17 +131,18 @@ class Encoder(nn.Module):
         Returns:
             float32 ``[latent]``.
         """
-        if planes.ndim == 3 and self.conv_channels:
-            x = jnp.concatenate([convolve(planes, self._layers(planes.shape[0])), shared])
+        channels = self.conv_channels[: min(planes.shape[1:]) - 1] if planes.ndim == 3 else ()
+        if channels:
+            x = jnp.concatenate([convolve(planes, self._layers(planes.shape[0], channels)), shared])
         else:
             x = MLP(self.mlp, final_activation=True)(jnp.concatenate([planes.reshape(-1), shared]))
         return nn.Dense(self.latent, kernel_init=initializer(1.0))(x)
 
-    def _layers(self, channels: int) -> list[Layer]:
+    def _layers(self, planes: int, channels: Sequence[int]) -> list[Layer]:
         """The weights of the convolutions."""
         layers = []
-        for i, width in enumerate(self.conv_channels):
-            shape = (4 * (self.conv_channels[i - 1] if i else channels), width)
+        for i, width in enumerate(channels):
+            shape = (4 * (channels[i - 1] if i else planes), width)
             weights = self.param(f"conv_{i}", initializer(2.0**0.5), shape)
             layers.append((weights, self.param(f"conv_{i}_bias", nn.initializers.zeros, (width,), jnp.float32)))
         return layers
