@@ -123,7 +123,15 @@ _SHARED = evolve(Config(), {"blocks": 2, "group": 8})
 _PAPER = Settings(_SHARED, ImplicitPlanner())
 # The planner is asked what each path on is worth, and so needs no policy: sequences, of which the curriculum is made
 # and which leave nothing to choose, teach it as well as choices do.
-_PLANNER = _PAPER.evolve({"planner.values_paths": True})
+_PLANNER = _PAPER.evolve(
+    {
+        "planner.values_paths": True,
+        # What is left out where a sub-task was not completed are failures: V^h would know of none.
+        "planner.learns_unfinished": True,
+        # A run makes some 50,000 decisions; without a policy that could run away more can be learned from each.
+        "planner.ppo.optimiser.epochs": 8,
+    }
+)
 _HRLSPEC = Settings(
     config=evolve(
         _SHARED,

@@ -145,11 +145,12 @@ def test_what_distinguishes_the_recipes(name: str) -> None:
     assert paper.relabel.share == 0.5
     assert (planner.max_operator, planner.learns_unfinished, planner.learns_from_copies) == (True, False, True)
     assert (planner.network.rounds, planner.network.advice, planner.transe) == (8, 0, 0.01)
-    # Recipe planner departs in one thing.
+    # Recipe planner departs in what V^h is asked, and in what it learns from.
     for reward_set, temperature in ((1, 400.0), (2, 80.0)):
         config, method = preset(name).settings("ours", "planner", reward_set)
         as_written, written = preset(name).settings("ours", "paper", reward_set)
         changes = {"high.values_paths": True, "high.inverse_temperature": temperature}
+        changes |= {"high.learns_unfinished": True, "high.ppo.optimiser.epochs": 8}
         assert (config, method) == (as_written, evolve(written, changes))
     ours, planner = config_of(name), planner_of(name)
     assert ours.network.roles
