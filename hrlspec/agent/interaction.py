@@ -175,15 +175,13 @@ def transition(
         keys, worker.env_state, action, params
     )
     labels = jax.vmap(env.labels, in_axes=(0, None))(env_state, params)
-    edge = worker.decision.edge
-    state = jax.vmap(advance)(task_of(book, worker.task), worker.task_state, labels, edge)
-    edge_taken = state.node != worker.task_state.node
+    task, state, edge_taken, lost = _progress(book, worker, labels)
     satisfied = (state.status == SATISFIED) & edge_taken
-    reached = book.tree.reach[worker.task, state.node]
+    # An automaton does not say what it was that let it move: whatever holds.
+    reached = labels if book.automata is not None else book.tree.reach[task, state.node]
     rules, reward = jax.vmap(rewards.step, in_axes=(None, 0, 0, 0, 0, 0))(
         machine, worker.rules, labels, reached, edge_taken, satisfied
     )
-    lost = jnp.take_along_axis(state.blocked, edge[:, None], 1)[:, 0]
     terminated = failed | (state.status != RUNNING)
     outcome = Outcome(
         labels=labels,
@@ -198,11 +196,27 @@ def transition(
         worker,
         env_state=env_state,
         view=_views(env, observation),
+        task=task,
         task_state=state,
         awaiting=edge_taken | lost,
         rules=rules,
     )
     return after, outcome
+
+
+def _progress(
+    book: TaskBook, worker: Worker, labels: Bool[Array, "E P"]
+) -> tuple[Int32[Array, " E"], TaskState, Bool[Array, " E"], Bool[Array, " E"]]:
+    """Rows of the book after one step, the tasks' states, whether they moved, whether the edge in force is lost."""
+    edge = worker.decision.edge
+    if book.automata is None:
+        state = jax.vmap(advance)(task_of(book, worker.task), worker.task_state, labels, edge)
+        lost = jnp.take_along_axis(state.blocked, edge[:, None], 1)[:, 0]
+        return worker.task, state, state.node != worker.task_state.node, lost
+    task = jax.vmap(book.automata.advance)(worker.task, labels)
+    moved = task != worker.task
+    state = jax.vmap(initial)(task_of(book, task))
+    return task, dataclasses.replace(state, status=book.automata.status[task]), moved, jnp.zeros_like(moved)
 
 
 def _views(env: Environment, observation: Float32[Array, "E ..."]) -> View:

@@ -25,6 +25,7 @@ from hrlspec.agent.networks.reach_critic import ReachCritic
 from hrlspec.agent.networks.tree import forks
 from hrlspec.config import Config
 from hrlspec.spec import TaskTree
+from hrlspec.spec.automata import Automata
 
 Params = dict[str, Any]
 """Parameters by part: ``low``, ``high`` and ``reach_critic``."""
@@ -38,11 +39,13 @@ class TaskBook:
         tree: the tasks, leading axis M.
         instructions: the instruction for each edge, leading axes ``[M, N]``.
         forks: bool ``[M, N]``, more than one way leads on from the node or from one below it.
+        automata: where the tasks are automata, whose states are the rows; else the trees are followed.
     """
 
     tree: TaskTree
     instructions: Instruction
     forks: Bool[Array, "*lead N"]
+    automata: Automata | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,10 +89,12 @@ class LowLevel:
         """The instruction for every edge of one task, leading axis N."""
         return cast(Instruction, self.controller.apply(params["low"], tree, method="instruct"))
 
-    def prepare(self, params: Params, trees: TaskTree) -> TaskBook:
-        """Prepares tasks (leading axis M) for acting."""
+    def prepare(self, params: Params, tasks: TaskTree | Automata) -> TaskBook:
+        """Prepares tasks for acting: trees (leading axis M), or automata, whose states are the M rows then."""
+        automata = tasks if isinstance(tasks, Automata) else None
+        trees = tasks.trees if isinstance(tasks, Automata) else tasks
         instructions = jax.vmap(self.instruct, in_axes=(None, 0))(params, trees)
-        return TaskBook(tree=trees, instructions=instructions, forks=jax.vmap(forks)(trees))
+        return TaskBook(tree=trees, instructions=instructions, forks=jax.vmap(forks)(trees), automata=automata)
 
     def instructions_at(
         self,

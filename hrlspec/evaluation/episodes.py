@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Bool, Float32, Int32, Key
+from jaxtyping import Bool, Float32, Int, Int32, Key
 
 from envs_jax.arrays import Array
 from envs_jax.base import Layout, State
@@ -22,6 +22,7 @@ from hrlspec.agent.agent import Agent
 from hrlspec.agent.interaction import act, assign, start, transition
 from hrlspec.agent.low_level import Params
 from hrlspec.spec import TaskTree
+from hrlspec.spec.automata import Automata
 from hrlspec.tasks.rewards import RewardMachine
 
 
@@ -64,9 +65,10 @@ def run_episodes(
     agent: Agent,
     params: Params,
     machine: RewardMachine,
-    trees: TaskTree,
+    tasks: TaskTree | Automata,
     layouts: Layout,
     *,
+    which: Int[np.ndarray, " B"] | None = None,
     greedy: bool = False,
     shield: bool = False,
     chunk: int = 500,
@@ -78,8 +80,9 @@ def run_episodes(
         agent: the networks.
         params: their parameters.
         machine: the rewards.
-        trees: tasks, leading axis B; any N.
+        tasks: trees, leading axis M, any N; or M automata.
         layouts: layouts of the environment, leading axis B.
+        which: int ``[B]``, the task of each episode; if not given there are as many, one for each.
         greedy: take the most likely action and sub-task instead of sampling.
         shield: replace actions that lead to propositions to be avoided.
         chunk: episodes run in parallel; bounds memory. Each size compiles once.
@@ -87,15 +90,20 @@ def run_episodes(
     Returns:
         JAX arrays, leading axis B.
     """
-    chex.assert_equal_shape_prefix(jax.tree.leaves((trees, layouts)), 1)
-    total = trees.parent.shape[0]
+    total = jax.tree.leaves(layouts)[0].shape[0]
+    which = np.arange(total) if which is None else which
+    num_tasks = len(tasks.start) if isinstance(tasks, Automata) else tasks.parent.shape[0]
+    chex.assert_shape(which, (total,))
+    if which.max() >= num_tasks or which.min() < 0:
+        raise ValueError(f"which names task {which.max()}, there are {num_tasks}")
     chunk = min(chunk, total)
     parts = []
     for first in range(0, total, chunk):
         # The last chunk is filled up by wrapping around, so that every chunk has one compiled shape.
         rows = np.arange(first, first + chunk) % total
-        some = jax.tree.map(lambda x, rows=rows: x[rows], (trees, layouts))
-        episodes, _ = _run(jax.random.fold_in(key, first), agent, params, machine, *some, greedy, shield, False)
+        some = jax.tree.map(lambda x, rows=rows: x[rows], layouts)
+        begun = _begun(tasks, which[rows])
+        episodes, _ = _run(jax.random.fold_in(key, first), agent, params, machine, *begun, some, greedy, shield, False)
         parts.append(jax.tree.map(lambda x, n=total - first: x[:n], episodes))
     return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
@@ -105,16 +113,25 @@ def trace_episodes(
     agent: Agent,
     params: Params,
     machine: RewardMachine,
-    trees: TaskTree,
+    tasks: TaskTree | Automata,
     layouts: Layout,
     *,
+    which: Int[np.ndarray, " B"] | None = None,
     greedy: bool = False,
     shield: bool = False,
 ) -> tuple[Episodes, Trace]:
     """As :func:`run_episodes`, for a few episodes, with their trajectories."""
-    episodes, trace = _run(key, agent, params, machine, trees, layouts, greedy, shield, True)
+    which = np.arange(jax.tree.leaves(layouts)[0].shape[0]) if which is None else which
+    episodes, trace = _run(key, agent, params, machine, *_begun(tasks, which), layouts, greedy, shield, True)
     assert trace is not None
     return episodes, trace
+
+
+def _begun(tasks: TaskTree | Automata, which: Int[np.ndarray, " B"]) -> tuple[TaskTree | Automata, Int32[Array, " B"]]:
+    """What a book is made of for some episodes, a tree for each or all states, and the row where each begins."""
+    if isinstance(tasks, Automata):
+        return tasks, jnp.asarray(tasks.start)[which]
+    return jax.tree.map(lambda x: x[which], tasks), jnp.arange(len(which), dtype=jnp.int32)
 
 
 @functools.partial(jax.jit, static_argnames=("agent", "greedy", "shield", "traced"))
@@ -123,16 +140,17 @@ def _run(
     agent: Agent,
     params: Params,
     machine: RewardMachine,
-    trees: TaskTree,
+    tasks: TaskTree | Automata,
+    rows: Int32[Array, " B"],
     layouts: Layout,
     greedy: bool,
     shield: bool,
     traced: bool,
 ) -> tuple[Episodes, Trace | None]:
-    num_episodes, num_nodes = trees.parent.shape
-    rows = jnp.arange(num_episodes, dtype=jnp.int32)
-    env, book = agent.env, agent.low.prepare(params, trees)
-    worker = start(jax.vmap(jax.random.fold_in, (None, 0))(key, rows), env, machine, book, layouts, rows)
+    env, book = agent.env, agent.low.prepare(params, tasks)
+    num_episodes, num_nodes = rows.shape[0], book.tree.num_nodes
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_episodes, dtype=jnp.int32))
+    worker = start(keys, env, machine, book, layouts, rows)
     noise_scale = 0.0 if greedy else 1.0
     zeros = jnp.zeros(num_episodes, jnp.float32)
     outcome = Episodes(success=zeros > 0, violated=zeros > 0, steps=zeros.astype(jnp.int32), returns=zeros)

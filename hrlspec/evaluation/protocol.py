@@ -9,6 +9,7 @@ Axes: **M** tasks, **B** episodes.
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import numpy as np
@@ -49,7 +50,7 @@ class SuiteEvaluation:
 
     def __call__(self, key: Key[Array, ""], agent: Agent, params: Params, machine: RewardMachine) -> SuiteResult:
         """Scores an agent. The key is consumed."""
-        how = {"greedy": self.greedy, "shield": self.shield}
+        how: dict[str, Any] = {"greedy": self.greedy, "shield": self.shield}
         cases = self.cases
         episodes = run_episodes(
             key, agent, params, machine, cases.trees, cases.layouts, chunk=_even(len(cases), self.chunk), **how

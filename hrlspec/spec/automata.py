@@ -1,0 +1,111 @@
+"""Tasks as automata, inside the jit: the states of all of them are rows of one table, each with a task tree.
+
+A state is what a row of a book of tasks is: when an automaton moves, its task goes on as another one. What the tree
+says of blocked edges and of the order of sub-tasks does not count: the automaton rules.
+
+Axes: **R** states of all automata, **L** labels, **M** automata, **P** atomic propositions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Bool, Int32
+
+from envs_jax.arrays import Array
+from hrlspec.spec.ltl.automaton import Automaton
+from hrlspec.spec.monitor import RUNNING, SATISFIED, VIOLATED
+from hrlspec.spec.tree import TaskTree
+from hrlspec.spec.unfold import unfold
+
+MAX_PROPOSITIONS = 16
+"""Most propositions of an environment: labels are looked up in a table of all sets of them."""
+
+
+@struct.dataclass
+class Automata:
+    """M tasks as automata over the same propositions and labels, state by state.
+
+    Attributes:
+        trees: what the agent is shown in each state, leading axis R.
+        successors: int32 ``[R, L]``, the row that each label leads to.
+        status: int32 ``[R]``, ``RUNNING``, ``SATISFIED`` or ``VIOLATED``.
+        column: int32 ``[2^P]``, which label a set of propositions is, bit i for proposition i; -1 for one that cannot
+            occur.
+        start: int32 ``[M]``, the row where each task begins.
+    """
+
+    trees: TaskTree
+    successors: Int32[Array, "R L"]
+    status: Int32[Array, " R"]
+    column: Int32[Array, " _"]
+    start: Int32[Array, " M"]
+
+    def advance(self, row: Int32[Array, ""], labels: Bool[Array, " P"]) -> Int32[Array, ""]:
+        """The row after one step, int32 ``[]``; a set of propositions that cannot occur changes nothing.
+
+        Args:
+            row: int32 ``[]``, where a task stands.
+            labels: bool ``[P]``, the propositions that hold now.
+        """
+        bits = 2 ** jnp.arange(labels.shape[0], dtype=jnp.int32)
+        column = jnp.asarray(self.column)[(labels * bits).sum()]
+        return jnp.where(column >= 0, jnp.asarray(self.successors)[row, jnp.maximum(column, 0)], row)
+
+
+def automata_of(
+    automata: Sequence[Automaton], propositions: Sequence[str], max_nodes: int
+) -> tuple[Automata, Bool[np.ndarray, " M"], Bool[np.ndarray, " M"]]:
+    """Puts automata together for acting.
+
+    Args:
+        automata: M of them, over the same labels in the same order.
+        propositions: names of the P propositions, in the order of an environment's labels.
+        max_nodes: N, padded size of the trees.
+
+    Returns:
+        The automata; and, bool ``[M]``, of which some tree was cut, and in which a way on begins where nothing holds.
+
+    Raises:
+        ValueError: there are too many propositions, or the labels differ.
+    """
+    if len(propositions) > MAX_PROPOSITIONS:
+        raise ValueError(f"found {len(propositions)} propositions, automata take {MAX_PROPOSITIONS} at most")
+    labels = automata[0].labels
+    if any(automaton.labels != labels for automaton in automata):
+        raise ValueError("the automata are over different labels")
+    unfolded = [unfold(automaton, propositions, max_nodes) for automaton in automata]
+    sizes = np.array([automaton.num_states for automaton in automata])
+    start = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    status = np.full(sizes.sum(), RUNNING, np.int32)
+    for first, automaton in zip(start, automata, strict=True):
+        for state, value in ((automaton.accepting, SATISFIED), (automaton.rejecting, VIOLATED)):
+            if state is not None:
+                status[first + state] = value
+    successors = [first + automaton.successors for first, automaton in zip(start, automata, strict=True)]
+    leaves: dict[str, Any] = {
+        "trees": jax.tree.map(lambda *x: np.concatenate(x), *(one.trees for one in unfolded)),
+        "successors": np.concatenate(successors).astype(np.int32),
+        "status": status,
+        "column": _columns(labels, propositions),
+        "start": start.astype(np.int32),
+    }
+    return (
+        Automata(**leaves),
+        np.array([one.cut.any() for one in unfolded]),
+        np.array([one.silent.any() for one in unfolded]),
+    )
+
+
+def _columns(labels: Iterable[Collection[str]], propositions: Sequence[str]) -> Int32[np.ndarray, " _"]:
+    """Which label each set of propositions is, int32 ``[2^P]``."""
+    bit = {name: 1 << i for i, name in enumerate(propositions)}
+    column = np.full(1 << len(propositions), -1, np.int32)
+    for number, label in enumerate(labels):
+        column[sum(bit[name] for name in label)] = number
+    return column

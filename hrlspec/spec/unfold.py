@@ -1,0 +1,212 @@
+"""From an automaton to task trees: what the agent is shown in each state.
+
+In a state q that is a tree rooted at q: useful simple paths to acceptance, shortest first. A move is useful unless
+whatever is accepted after it would have been accepted without it. A sub-task's p₊ is the least that must hold for the
+automaton to move, its p₋ what takes the way on from it.
+
+Axes: **Q** states, **L** labels, **N** tree nodes, **P** atomic propositions.
+"""
+
+from __future__ import annotations
+
+import collections
+import functools
+import heapq
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool
+
+from hrlspec.spec.ltl.automaton import Automaton
+from hrlspec.spec.tree import TaskTree
+
+Label = frozenset[str]
+
+
+class Move(NamedTuple):
+    """A step of the automaton that a sub-task can ask for.
+
+    Attributes:
+        reach: p₊, propositions that hold together.
+        avoid: p₋ without what other moves of the state reach.
+        target: the state that it leads to.
+    """
+
+    reach: Label
+    avoid: Label
+    target: int
+
+
+class Unfolded(NamedTuple):
+    """What the agent is shown in each state of an automaton.
+
+    Attributes:
+        trees: leading axis Q; numpy leaves. In a state without moves the tree is a root without children.
+        cut: bool ``[Q]``, paths were left out because N nodes are too few.
+        silent: bool ``[Q]``, a way on is left out because it begins where nothing holds, which no sub-task can ask for.
+    """
+
+    trees: TaskTree
+    cut: Bool[np.ndarray, " Q"]
+    silent: Bool[np.ndarray, " Q"]
+
+
+def unfold(automaton: Automaton, propositions: Sequence[str], max_nodes: int) -> Unfolded:
+    """The task tree of each state of an automaton.
+
+    Args:
+        automaton: over these propositions.
+        propositions: names of the P propositions.
+        max_nodes: N, padded size of the trees.
+    """
+    moves = _Moves(automaton)
+    rows, cut = [], []
+    for state in range(automaton.num_states):
+        nodes, complete = _paths(moves, state, max_nodes)
+        rows.append(_tree(nodes, propositions, max_nodes))
+        cut.append(not complete)
+    trees: TaskTree = jax.tree.map(lambda *x: np.stack(x), *rows)
+    return Unfolded(trees, np.array(cut), np.array([moves.silent(state) for state in range(automaton.num_states)]))
+
+
+class _Moves:
+    """The moves of each state, and how far acceptance is."""
+
+    def __init__(self, automaton: Automaton) -> None:
+        self.automaton = automaton
+        self.after = {label: automaton.successors[:, column].tolist() for column, label in enumerate(automaton.labels)}
+        self.distance = self._distances()
+        self.within = self._inclusions()
+
+    @functools.cache  # noqa: B019  # an object lives as long as one unfolding
+    def of(self, state: int) -> tuple[Move, ...]:
+        """The useful moves of a state, those that ask for least first."""
+        targets: dict[int, list[Label]] = collections.defaultdict(list)
+        for label, after in self.after.items():
+            if label and self._is_useful(state, after[state]):
+                targets[after[state]].append(label)
+        moves = []
+        for target, labels in targets.items():
+            least = [label for label in labels if not any(other < label for other in labels)]
+            moves += [Move(label, self._avoid(state, label, target), target) for label in least]
+        return tuple(sorted(moves, key=lambda move: (len(move.reach), sorted(move.reach))))
+
+    def silent(self, state: int) -> bool:
+        """Whether a useful move begins where nothing holds."""
+        nothing = self.after.get(frozenset())
+        return nothing is not None and self._is_useful(state, nothing[state])
+
+    def _is_useful(self, state: int, target: int) -> bool:
+        """Whether acceptance can be reached after a move, and something is accepted that was not before."""
+        return target in self.distance and not self.within[target, state]
+
+    def _avoid(self, state: int, reach: Label, target: int) -> Label:
+        """All that holds, besides p₊, where the automaton goes astray.
+
+        That is where it does not go where p₊ leads to, although p₊ holds; and where it goes to a state from which p₊
+        leads to less.
+        """
+        harmful: set[str] = set()
+        for label, after in self.after.items():
+            onward = after[state] if label >= reach else self.after[reach][after[state]]
+            if not self.within[target, onward]:
+                harmful |= label - reach
+        return frozenset(harmful)
+
+    def _inclusions(self) -> Bool[np.ndarray, "Q Q"]:
+        """Entry (q, r): all that is accepted from q is accepted from r; the largest such relation."""
+        successors, states = self.automaton.successors, np.arange(self.automaton.num_states)
+        accepting = states == self.automaton.accepting
+        within = ~accepting[:, None] | accepting
+        while True:
+            narrower = within.copy()
+            for after in successors.T:
+                narrower &= within[np.ix_(after, after)]
+            if np.array_equal(narrower, within):
+                return within
+            within = narrower
+
+    def _distances(self) -> dict[int, int]:
+        """Least moves to acceptance, of the states from which it can be reached where something holds at each."""
+        accepting = self.automaton.accepting
+        if accepting is None:
+            return {}
+        found, queue = {accepting: 0}, collections.deque([accepting])
+        before: dict[int, set[int]] = collections.defaultdict(set)
+        for label, after in self.after.items():
+            for state, successor in enumerate(after):
+                if label and state != successor:
+                    before[successor].add(state)
+        while queue:
+            state = queue.popleft()
+            for earlier in before[state] - found.keys():
+                found[earlier] = found[state] + 1
+                queue.append(earlier)
+        return found
+
+
+_Path = tuple[Move, ...]
+
+
+def _paths(moves: _Moves, start: int, max_nodes: int) -> tuple[list[_Path], bool]:
+    """Nodes of the tree, each by the path to it, parents first; and whether all paths found room."""
+    nodes: dict[_Path, None] = {(): None}
+    complete = True
+    for path in _simple_paths(moves, start):
+        prefixes = [path[:length] for length in range(1, len(path) + 1)]
+        new = [prefix for prefix in prefixes if prefix not in nodes]
+        if len(nodes) + len(new) > max_nodes:
+            complete = False
+            break
+        nodes.update(dict.fromkeys(new))
+    return sorted(nodes, key=len), complete
+
+
+def _simple_paths(moves: _Moves, start: int) -> Iterator[_Path]:
+    """Paths to acceptance that visit no state twice, shortest first; never more of them than are asked for."""
+    accepting = moves.automaton.accepting
+    if start not in moves.distance or start == accepting:
+        return
+    count = itertools.count()
+    queue: list[tuple[int, int, int, _Path]] = [(moves.distance[start], 0, next(count), ())]
+    while queue:
+        _, _, _, path = heapq.heappop(queue)
+        here = path[-1].target if path else start
+        if here == accepting:
+            yield path
+            continue
+        visited = {start, *(move.target for move in path)}
+        for move in moves.of(here):
+            if move.target not in visited:
+                length = len(path) + 1
+                bound = length + moves.distance[move.target]
+                heapq.heappush(queue, (bound, -length, next(count), (*path, move)))
+
+
+def _tree(nodes: Sequence[_Path], propositions: Sequence[str], max_nodes: int) -> TaskTree:
+    """A tree with numpy leaves, padded."""
+    index = {path: number for number, path in enumerate(nodes)}
+    parent = np.full(max_nodes, TaskTree.NO_NODE, np.int32)
+    reach, avoid = np.zeros((2, max_nodes, len(propositions)), bool)
+    depth = np.zeros(max_nodes, np.int32)
+    place = {name: column for column, name in enumerate(propositions)}
+    for path, node in index.items():
+        if path:
+            parent[node], depth[node] = index[path[:-1]], len(path)
+            reach[node, [place[name] for name in path[-1].reach]] = True
+            avoid[node, [place[name] for name in path[-1].avoid]] = True
+    valid = np.arange(max_nodes) < len(nodes)
+    inner = np.zeros(max_nodes, bool)
+    inner[parent[parent >= 0]] = True
+    leaves: dict[str, Any] = {
+        "parent": parent,
+        "reach": reach,
+        "avoid": avoid,
+        "accepting": valid & ~inner & (parent >= 0),
+        "valid": valid,
+        "depth": depth,
+    }
+    return TaskTree(**leaves)

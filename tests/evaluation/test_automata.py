@@ -1,0 +1,89 @@
+"""Acting on automata: as on the tree where one says the same, and with second tries where no tree can."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs_jax
+from hrlspec.evaluation import run_episodes
+from hrlspec.evaluation.episodes import trace_episodes
+from hrlspec.spec import compile_task, parse
+from hrlspec.spec.automata import Automata, automata_of
+from hrlspec.spec.ltl import parse_ltl, satisfies_ltl, to_automaton
+from hrlspec.tasks.rewards import reward_machine
+from tests.evaluation.scripted import manner, walker
+
+LETTER = envs_jax.make("letter")
+NAMES = LETTER.propositions
+COMPLETION = reward_machine(NAMES)
+WALKER = walker(LETTER)
+KEY = jax.random.key(0)
+
+
+def tasks(*texts: str, max_nodes: int = 8) -> Automata:
+    labels = [frozenset(), *(frozenset({name}) for name in NAMES)]
+    return automata_of([to_automaton(parse_ltl(text), NAMES, labels) for text in texts], NAMES, max_nodes)[0]
+
+
+def layouts(count: int, seed: int = 0) -> np.ndarray:
+    keys = jax.random.split(jax.random.key(seed), count)
+    return np.asarray(jax.vmap(LETTER.sample_layout, (0, None))(keys, LETTER.default_params))
+
+
+@pytest.mark.parametrize("last", [False, True])
+def test_step_for_step_as_on_the_tree(last: bool) -> None:
+    """Where no second try is to be had."""
+    twins = {
+        "achieve a; achieve b": "F (a & F b)",
+        "achieve a or achieve c": "F (a | c)",
+        "achieve b ensuring not a": "!a U b",
+    }
+    some = layouts(12)
+    for text, ltl in twins.items():
+        tree = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 12), compile_task(parse(text), NAMES, 8))
+        on_tree, trace = trace_episodes(KEY, WALKER, manner(last=last), COMPLETION, tree, some, greedy=True)
+        which = np.zeros(12, int)
+        other = trace_episodes(KEY, WALKER, manner(last=last), COMPLETION, tasks(ltl), some, which=which, greedy=True)
+        on_automaton, other_trace = other
+        jax.tree.map(np.testing.assert_array_equal, on_tree, on_automaton)
+        np.testing.assert_array_equal(trace.running, other_trace.running)
+        places = (np.asarray(some.env_state.position)[np.asarray(some.running)] for some in (trace, other_trace))
+        np.testing.assert_array_equal(*places)
+        assert np.asarray(on_tree.success).all()
+
+
+def test_a_second_try() -> None:
+    """No tree says this: c before d withdraws b, and an agent that steps on c must go for b again."""
+    text = "!a U (b & (!c U d))"
+    some = layouts(64, seed=3)
+    which = np.zeros(64, int)
+    episodes, trace = trace_episodes(KEY, WALKER, manner(), COMPLETION, tasks(text), some, which=which, greedy=True)
+    assert np.asarray(episodes.success).mean() > 0.9
+    states = trace.env_state
+    labels = np.asarray(jax.vmap(jax.vmap(lambda state: LETTER.labels(state, LETTER.default_params)))(states))
+    for episode in range(64):
+        steps = int(episodes.steps[episode])
+        # Entry t is the state before step t: entry 1 has the labels after the first action; the last are not there.
+        seen = [{name for name, holds in zip(NAMES, labels[t, episode], strict=True) if holds} for t in range(1, steps)]
+        assert not satisfies_ltl(parse_ltl(text), seen)
+        if episodes.success[episode]:
+            assert satisfies_ltl(parse_ltl(text), [*seen, {"d"}]) or satisfies_ltl(parse_ltl(text), [*seen, {"b"}])
+
+
+def test_tasks_of_any_size_in_one_program() -> None:
+    """Which task an episode has, whose states are rows of one table, does not change how it goes."""
+    texts = ("F (a & F b)", "F a & F b & F c", "!a U (b & (!c U d))")
+    together, some = tasks(*texts, max_nodes=16), layouts(9, seed=5)
+    how = {"greedy": True}
+    mixed = run_episodes(KEY, WALKER, manner(), COMPLETION, together, some, which=np.arange(9) % 3, **how)
+    for number, text in enumerate(texts):
+        alone = run_episodes(
+            KEY, WALKER, manner(), COMPLETION, tasks(text, max_nodes=16), some, which=np.zeros(9, int), **how
+        )
+        for one, other in zip(jax.tree.leaves(mixed), jax.tree.leaves(alone), strict=True):
+            np.testing.assert_array_equal(one[number::3], other[number::3])
+    with pytest.raises(ValueError, match="which names task 3, there are 3"):
+        run_episodes(KEY, WALKER, manner(), COMPLETION, together, some, which=np.full(9, 3), **how)
