@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import itertools
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import jax
@@ -92,6 +94,11 @@ class Box:
         return value.shape == self.shape and bool(np.all((value >= self.low) & (value <= self.high)))
 
 
+def at_most_one(propositions: Sequence[str]) -> tuple[frozenset[str], ...]:
+    """Nothing, or one proposition alone: the labels of worlds whose goals lie apart."""
+    return (frozenset(), *(frozenset({name}) for name in propositions))
+
+
 @dataclasses.dataclass(frozen=True)
 class Symmetries:
     """Says that a world of square images stays the same world when it is turned or reflected.
@@ -168,6 +175,17 @@ class Environment(abc.ABC):
     def num_propositions(self) -> int:
         """P."""
         return len(self.propositions)
+
+    @property
+    def possible_labels(self) -> tuple[frozenset[str], ...]:
+        """The sets of propositions that can hold together; all of them, unless a world knows better.
+
+        The fewer there are, the smaller the automata of tasks and the more is known of what to avoid. In layouts that
+        were made by hand others may occur; an automaton then stays where it is.
+        """
+        sizes = range(self.num_propositions + 1)
+        some = itertools.chain.from_iterable(itertools.combinations(self.propositions, size) for size in sizes)
+        return tuple(map(frozenset, some))
 
     @property
     def default_params(self) -> EnvParams:

@@ -27,6 +27,7 @@ from envs_jax.base import (
     StepResult,
     Symmetric,
     Symmetries,
+    at_most_one,
 )
 from envs_jax.letter.contested import most_contested, myopia_regret
 from envs_jax.scenes import GridScene
@@ -112,6 +113,11 @@ class Letter(Symmetric, FiniteGraph, ContestedLayouts, Drawable):
     def propositions(self) -> tuple[str, ...]:
         """``('a', 'b', ...)``."""
         return tuple(string.ascii_lowercase[: self.num_letters])
+
+    @property
+    def possible_labels(self) -> tuple[frozenset[str], ...]:
+        """A cell has one letter at most."""
+        return at_most_one(self.propositions)
 
     @property
     def num_actions(self) -> int:

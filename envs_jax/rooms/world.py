@@ -15,7 +15,7 @@ from flax import struct
 from jaxtyping import Bool, Float32, Int, Int32, Key, Shaped
 
 from envs_jax.arrays import Array
-from envs_jax.base import Box, Discrete, Drawable, EnvParams, StepResult
+from envs_jax.base import Box, Discrete, Drawable, EnvParams, StepResult, at_most_one
 from envs_jax.scenes import GridScene
 
 ROOM = 3
@@ -61,6 +61,11 @@ class Rooms(Drawable):
     action_space = Discrete(n=4)
     observation_shape = (4, ROWS, COLUMNS)
     observation_space = Box(low=0.0, high=1.0, shape=(4, ROWS, COLUMNS))
+
+    @property
+    def possible_labels(self) -> tuple[frozenset[str], ...]:
+        """The balls lie in different cells."""
+        return at_most_one(self.propositions)
 
     def sample_layout(self, key: Key[Array, ""], params: EnvParams) -> RoomsLayout:
         """Uniform cells in their rooms; the key at the far wall, on no direct way from the start to the door."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import math
 from typing import Any
 
@@ -153,6 +154,18 @@ class Walk(GridMap, Drawable):
     def propositions(self) -> tuple[str, ...]:
         """The discs' propositions in alphabetical order."""
         return tuple(sorted({name for name, *_ in self.discs}))
+
+    @property
+    def possible_labels(self) -> tuple[frozenset[str], ...]:
+        """Sets of propositions of which every two have discs that overlap."""
+        discs = self._layout().discs
+        regions = {name: discs[:, i, discs[2, i] > 0].T for i, name in enumerate(self.propositions)}
+        apart = {
+            frozenset({one, other})
+            for one, other in itertools.combinations(regions, 2)
+            if not any(math.dist(a[:2], b[:2]) < a[2] + b[2] for a in regions[one] for b in regions[other])
+        }
+        return tuple(label for label in super().possible_labels if not any(pair <= label for pair in apart))
 
     @property
     def observation_shape(self) -> tuple[int, ...]:

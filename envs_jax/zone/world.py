@@ -26,6 +26,7 @@ from envs_jax.base import (
     Reflections,
     StepResult,
     Symmetric,
+    at_most_one,
 )
 from envs_jax.scenes import DiscScene, Region
 from envs_jax.zone import physics as zone_physics
@@ -112,6 +113,11 @@ class Zone(Symmetric, ContestedLayouts, ContestedChoice, Drawable):
     def propositions(self) -> tuple[str, ...]:
         """``('blue', 'green', 'red', 'yellow')``."""
         return COLOURS
+
+    @property
+    def possible_labels(self) -> tuple[frozenset[str], ...]:
+        """Zones that are drawn lie apart."""
+        return at_most_one(self.propositions)
 
     @property
     def observation_shape(self) -> tuple[int, ...]:

@@ -191,3 +191,29 @@ def test_a_resampled_layout_differs_only_where_needed(env: envs_jax.Environment)
     # The very draw that gave this layout must be passed over.
     again = resample(jax.random.key(6), layout, jnp.bool_(True), params)
     assert _same(again, layout) == (env.name in ONE_LAYOUT)
+
+
+def test_labels_that_occur_are_said_to_be_possible(env: envs_jax.Environment) -> None:
+    """Everywhere where there is a graph or a grid; elsewhere on random ways."""
+    layout = jax.tree.map(np.asarray, env.sample_layout(jax.random.key(3), env.default_params))
+    if isinstance(env, envs_jax.FiniteGraph):
+        labels = np.asarray(env.transition_table(layout, env.default_params)[1])
+    elif isinstance(env, envs_jax.GridMap):
+        labels = env.grid(layout)[0].reshape(-1, env.num_propositions)
+    else:
+        _, state = env.reset_to(layout, jax.random.key(0), env.default_params)
+        found = []
+        for key in jax.random.split(jax.random.key(1), 40):
+            state = _jitted(env, "step_env")(key, state, env.action_space.sample(key), env.default_params)[1]
+            found.append(np.asarray(env.labels(state, env.default_params)))
+        labels = np.array(found)
+    names = np.array(env.propositions)
+    assert {frozenset(names[row].tolist()) for row in np.unique(labels, axis=0)} <= set(env.possible_labels)
+    assert len(set(env.possible_labels)) == len(env.possible_labels)
+    assert frozenset() in env.possible_labels
+
+
+def test_how_many_labels_are_possible() -> None:
+    """The peers' FlatWorld has these thirteen; the paper's Walk has no two regions that overlap."""
+    numbers = {"letter": 6, "letter12": 13, "walk": 6, "flatworld": 13, "zone": 5}
+    assert {name: len(envs_jax.make(name).possible_labels) for name in numbers} == numbers
