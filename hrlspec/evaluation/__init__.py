@@ -6,6 +6,7 @@ from hrlspec.evaluation.aggregate import Aggregate, aggregate
 from hrlspec.evaluation.cases import BranchCases, Cases, make_branch_cases, make_cases
 from hrlspec.evaluation.episodes import Episodes, run_episodes
 from hrlspec.evaluation.first_choice import FirstChoiceEvaluation, FirstChoiceResult, first_choice_evaluation
+from hrlspec.evaluation.ltl import FormulaScore, LtlResult, LtlSuite, evaluate_ltl, ltl_suite
 from hrlspec.evaluation.protocol import (
     ChoiceEvaluation,
     ReturnEvaluation,
@@ -28,6 +29,9 @@ __all__ = [
     "Episodes",
     "FirstChoiceEvaluation",
     "FirstChoiceResult",
+    "FormulaScore",
+    "LtlResult",
+    "LtlSuite",
     "ReturnEvaluation",
     "ReturnResult",
     "Score",
@@ -37,9 +41,11 @@ __all__ = [
     "TaskScore",
     "aggregate",
     "choice_evaluation",
+    "evaluate_ltl",
     "evaluate_suite",
     "final_evaluation",
     "first_choice_evaluation",
+    "ltl_suite",
     "make_branch_cases",
     "make_cases",
     "periodic_evaluation",

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from rich import box
 from rich.table import Table
 
-from hrlspec.evaluation import Aggregate, SuiteResult
+from hrlspec.evaluation import Aggregate, LtlResult, SuiteResult
 from hrlspec.evaluation.results import OVER_EPISODES, OVER_TASKS
 from hrlspec.evaluation.stats import Interval
 from hrlspec.run.learner import FinalResults
@@ -51,6 +51,29 @@ def suite_table(result: SuiteResult) -> Table:
         table.add_row(f"depth {depth}{mark}", *(_cell(getattr(score, name)) for name in names))
     table.add_section()
     table.add_row("all", *(_cell(getattr(total, name)) for name in names), style="bold")
+    return table
+
+
+def ltl_table(result: LtlResult) -> Table:
+    """Success, violations and steps of each formula, and their means."""
+    remarks = ["greedy actions" if result.greedy else "sampled actions", "95 % intervals over episodes"]
+    remarks.append("steps of successful episodes")
+    if any(score.cut for score in result.per_formula):
+        remarks.append("* some paths to acceptance were left out, for a tree was too small")
+    if any(score.silent for score in result.per_formula):
+        remarks.append("† some way on begins where nothing holds, which no sub-task asks for")
+    table = plain_table(
+        f"{result.suite} ({len(result.per_formula)} formulas, {result.episodes} episodes of each)",
+        ["formula", "success", "violated", "steps"],
+        "; ".join(remarks),
+    )
+    table.columns[0].no_wrap = False
+    for score in result.per_formula:
+        mark = "*" * score.cut + "†" * score.silent
+        rates = _cell(score.success_rate), f"{score.violation_rate.estimate:.3f}", _cell(score.steps_mean)
+        table.add_row(score.formula + mark, *rates)
+    table.add_section()
+    table.add_row("mean", f"{result.success_rate:.3f}", "", f"{result.steps_mean:.1f}", style="bold")
     return table
 
 

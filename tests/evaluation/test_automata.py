@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import envs_jax
-from hrlspec.evaluation import run_episodes
+from hrlspec.evaluation import evaluate_ltl, ltl_suite, run_episodes
 from hrlspec.evaluation.episodes import trace_episodes
+from hrlspec.presets.peers import peer_formulas, peer_suites
 from hrlspec.spec import compile_task, parse
 from hrlspec.spec.automata import Automata, automata_of
 from hrlspec.spec.ltl import parse_ltl, satisfies_ltl, to_automaton
@@ -87,3 +90,30 @@ def test_tasks_of_any_size_in_one_program() -> None:
             np.testing.assert_array_equal(one[number::3], other[number::3])
     with pytest.raises(ValueError, match="which names task 3, there are 3"):
         run_episodes(KEY, WALKER, manner(), COMPLETION, together, some, which=np.full(9, 3), **how)
+
+
+def test_a_suite_of_formulas() -> None:
+    """One that nothing satisfies, one that is satisfied at once, and one with a bad end that is avoided."""
+    text = "# formulas\nfalse\nF (a | b | c | d | e | !a)\n\n!a U b  # clear of a\n"
+    suite = ltl_suite("some", text, LETTER)
+    assert suite.formulas == ("false", "F (a | b | c | d | e | !a)", "!a U b")
+    assert suite.num_states.tolist() == [1, 2, 3]
+    found = evaluate_ltl(KEY, WALKER, manner(), COMPLETION, suite, episodes=40, greedy=True)
+    rates = [score.success_rate.estimate for score in found.per_formula]
+    assert rates == [0, 1, 1]
+    assert found.per_formula[1].steps_mean.estimate == 1
+    assert found.success_rate == pytest.approx(2 / 3)
+    json.dumps(found.to_json(), allow_nan=False)
+    again = evaluate_ltl(KEY, WALKER, manner(), COMPLETION, suite, episodes=40, greedy=True, chunk=7)
+    assert [score.success_rate for score in again.per_formula] == [score.success_rate for score in found.per_formula]
+
+
+@pytest.mark.parametrize("name", peer_suites())
+def test_published_formulas_can_be_carried_out(name: str) -> None:
+    """In their world, whose labels are the peers'; nothing asks for a step on which nothing holds."""
+    env = envs_jax.make("flatworld" if "flatworld" in name else "letter12")
+    suite = ltl_suite(name, peer_formulas(name), env)
+    assert len(suite) in (5, 8, 10, 49, 50)
+    assert not suite.silent.any()
+    starts = np.asarray(suite.automata.start)
+    assert (np.asarray(suite.automata.trees.valid)[starts].sum(-1) > 1).all()

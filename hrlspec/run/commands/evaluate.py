@@ -19,8 +19,10 @@ from hrlspec.agent.agent import Agent
 from hrlspec.agent.low_level import Params
 from hrlspec.api import TrainedAgent, evaluate
 from hrlspec.config import Checked, setting
-from hrlspec.evaluation import Suite, SuiteResult, suite_from_text
+from hrlspec.evaluation import LtlResult, LtlSuite, Suite, SuiteResult, evaluate_ltl, ltl_suite, suite_from_text
+from hrlspec.evaluation.ltl import MAX_NODES as LTL_NODES
 from hrlspec.evaluation.suite import MAX_NODES
+from hrlspec.presets.peers import peer_formulas
 from hrlspec.run import platform
 from hrlspec.run.console import result_console
 from hrlspec.run.errors import UserError
@@ -28,11 +30,12 @@ from hrlspec.run.experiment import Experiment, experiment_of
 from hrlspec.run.extras import check_drawing, drawing
 from hrlspec.run.flags import parse_flags
 from hrlspec.run.folder import check_writable, read_record
-from hrlspec.run.tables import suite_table
+from hrlspec.run.tables import ltl_table, suite_table
 from hrlspec.run.unseen import with_tasks
 from hrlspec.spec import bare_lines
 
 MOST_PICTURES = 9
+_TASKS = ("spec", "spec_file", "ltl", "ltl_file", "suite")
 _LARGEST_FILE = 1_000_000  # bytes
 
 
@@ -40,7 +43,7 @@ _LARGEST_FILE = 1_000_000  # bytes
 class EvaluateFlags(Checked):
     """Reports success, return, steps and SPL of a trained agent on the given tasks, in layouts drawn at random.
 
-    Exactly one of --spec, --spec-file and --suite says which tasks.
+    Exactly one of --spec, --spec-file, --ltl, --ltl-file and --suite says which tasks.
     """
 
     run: Path
@@ -49,10 +52,14 @@ class EvaluateFlags(Checked):
     """A task in SPECTRL, such as "achieve a; (achieve b ensuring not c)"."""
     spec_file: Path | None = None
     """A file with one task a line; # begins a comment."""
+    ltl: str | None = None
+    """A task in linear temporal logic, such as "F (a & (!b U c))", to be satisfied by the end of the episode."""
+    ltl_file: Path | None = None
+    """A file with one such formula a line."""
     suite: str | None = None
-    """A test suite of the run's environment, such as dag."""
+    """A suite of the run's environment, such as dag, or published formulas, such as jaxolotl/letter_finite."""
     episodes: int = setting(500, least=1, most=1_000_000)
-    """In all; at least one for each task."""
+    """In all; at least one for each task. For formulas in LTL, of each."""
     seed: int = setting(0, least=0, most=2**31 - 1)
     """Of layouts and actions."""
     step: int | None = None
@@ -62,7 +69,7 @@ class EvaluateFlags(Checked):
     shield: bool = False
     """Replace actions that would step on forbidden propositions."""
     max_nodes: int = setting(MAX_NODES, least=2, most=4096)
-    """Largest task tree."""
+    """Largest task tree. Trees of formulas in LTL are cut at 64 nodes, or fewer."""
     draw: Path | None = None
     """A picture (.png or .svg) of one episode of each task, of the first nine."""
     json: bool = False
@@ -84,13 +91,24 @@ def main(argv: Sequence[str], *, program: str = "hrlspec evaluate") -> None:
     flags = parse_flags(EvaluateFlags, argv, program=program)
     _check(flags)
     experiment = experiment_of(read_record(flags.run)["config"], str(flags.run))
-    suite = tasks_of(flags, experiment)
+    formulas = formulas_of(flags, experiment)
+    suite = None if formulas else tasks_of(flags, experiment)
     platform.prepare()
     agent = experiment.agent
     params, step = load_params(agent, flags.run, flags.step)
+    facts = {"run": str(flags.run), "checkpoint_step": step, "reward_set": experiment.reward_set}
+    key = jax.random.fold_in(jax.random.key(flags.seed), 1)
+    if formulas is not None:
+        how: dict[str, Any] = {"seed": flags.seed, "greedy": flags.greedy, "shield": flags.shield}
+        found = evaluate_ltl(
+            key, agent, params, experiment.rewards, formulas, episodes=flags.episodes, chunk=flags.episodes, **how
+        )
+        _show(flags, found, facts)
+        return
+    assert suite is not None
     try:
         result = evaluate(
-            jax.random.fold_in(jax.random.key(flags.seed), 1),
+            key,
             TrainedAgent(agent, params, experiment.rewards),
             suite,
             episodes=flags.episodes,
@@ -100,18 +118,21 @@ def main(argv: Sequence[str], *, program: str = "hrlspec evaluate") -> None:
         )
     except ValueError as error:
         raise UserError(str(error)) from error  # a task that nothing can satisfy
-    _show(flags, result, {"run": str(flags.run), "checkpoint_step": step, "reward_set": experiment.reward_set})
+    _show(flags, result, facts)
     if flags.draw is not None:
         with drawing():
             _draw(flags, agent, params, experiment, suite)
 
 
-def _show(flags: EvaluateFlags, result: SuiteResult, facts: dict[str, Any]) -> None:
+def _show(flags: EvaluateFlags, result: SuiteResult | LtlResult, facts: dict[str, Any]) -> None:
     """Prints the results."""
     if flags.json:
         print(json.dumps({**facts, **result.to_json()}, allow_nan=False), flush=True)
         return
     console = result_console()
+    if isinstance(result, LtlResult):
+        console.print(ltl_table(result))
+        return
     console.print(suite_table(result))
     if 1 < len(result.per_task) <= 20:
         for task in result.per_task:
@@ -139,6 +160,25 @@ def load_params(agent: Agent, run: Path, step: int | None = None) -> tuple[Param
     target = {"params": jax.eval_shape(agent.init, jax.random.key(0))}
     restored = checkpoint.load(run / "checkpoints", target, step=step, partial=True)
     return restored.state["params"], restored.step
+
+
+def formulas_of(flags: EvaluateFlags, experiment: Experiment) -> LtlSuite | None:
+    """The formulas in LTL that the flags name; ``None`` if they name tasks in SPECTRL.
+
+    Raises:
+        UserError: no such file.
+        SuiteError: no such suite.
+        SpecError: a formula cannot be read, or its automaton is too large.
+    """
+    if flags.ltl is not None:
+        name, text = "--ltl", " ".join(bare_lines(flags.ltl))
+    elif flags.ltl_file is not None:
+        name, text = flags.ltl_file.name, _read(flags.ltl_file)
+    elif flags.suite is not None and "/" in flags.suite:
+        name, text = flags.suite, peer_formulas(flags.suite)
+    else:
+        return None
+    return ltl_suite(name, text, experiment.preset.make(), max_nodes=min(flags.max_nodes, LTL_NODES))
 
 
 def tasks_of(flags: EvaluateFlags, experiment: Experiment) -> Suite:
@@ -171,10 +211,13 @@ def _read(file: Path) -> str:
 
 
 def _check(flags: EvaluateFlags) -> None:
-    given = [name for name in ("spec", "spec_file", "suite") if getattr(flags, name) is not None]
+    given = [name for name in _TASKS if getattr(flags, name) is not None]
     if len(given) != 1:
         found = " and ".join(f"--{name.replace('_', '-')}" for name in given) or "none"
-        raise UserError(f"expected exactly one of --spec, --spec-file and --suite, found {found}")
+        flags_there_are = ", ".join(f"--{name.replace('_', '-')}" for name in _TASKS[:-1])
+        raise UserError(f"expected exactly one of {flags_there_are} and --suite, found {found}")
+    if flags.draw is not None and not (flags.spec or flags.spec_file) and (flags.ltl or flags.ltl_file):
+        raise UserError("--draw takes tasks in SPECTRL, not in LTL")
     if flags.draw is not None and flags.draw.suffix not in (".png", ".svg"):
         raise UserError(f"--draw {flags.draw}: expected a file that ends in .png or .svg")
     if flags.draw is not None:

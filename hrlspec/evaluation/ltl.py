@@ -1,0 +1,229 @@
+"""Evaluating an agent on tasks in linear temporal logic, which it carries out as automata.
+
+Axes: **M** formulas, **B** episodes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Int, Key
+
+from envs_jax import Environment
+from envs_jax.arrays import Array
+from hrlspec.agent.agent import Agent
+from hrlspec.agent.low_level import Params
+from hrlspec.evaluation.episodes import run_episodes
+from hrlspec.evaluation.results import interval_to_json
+from hrlspec.evaluation.stats import Interval, mean_interval, rate_interval
+from hrlspec.spec import SpecError, bare_lines
+from hrlspec.spec.automata import Automata, automata_of
+from hrlspec.spec.ltl import parse_ltl, to_automaton
+from hrlspec.tasks.rewards import RewardMachine
+
+MAX_NODES = 64
+"""Default for the trees that the states of automata show: of larger ones the longest paths are left out."""
+EPISODES = 512
+"""Of each formula, as the peers have it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LtlSuite:
+    """M formulas to evaluate on.
+
+    Attributes:
+        name: under which results are reported.
+        formulas: their text.
+        automata: the tasks for acting.
+        num_states: int ``[M]``, of each automaton.
+        cut: bool ``[M]``, some state has more paths to acceptance than its tree shows.
+        silent: bool ``[M]``, some way on begins where nothing holds, which no sub-task can ask for.
+    """
+
+    name: str
+    formulas: tuple[str, ...]
+    automata: Automata
+    num_states: Int[np.ndarray, " M"]
+    cut: Bool[np.ndarray, " M"]
+    silent: Bool[np.ndarray, " M"]
+
+    def __len__(self) -> int:
+        """M."""
+        return len(self.formulas)
+
+
+@dataclasses.dataclass(frozen=True)
+class FormulaScore:
+    """How an agent did on one formula.
+
+    Attributes:
+        formula: its text.
+        num_states: of its automaton.
+        cut: see `LtlSuite`.
+        silent: see `LtlSuite`.
+        success_rate: of its episodes.
+        violation_rate: nothing that could follow would have satisfied it, or the environment ended the episode.
+        steps_mean: of the successful episodes.
+    """
+
+    formula: str
+    num_states: int
+    cut: bool
+    silent: bool
+    success_rate: Interval
+    violation_rate: Interval
+    steps_mean: Interval
+
+    def to_json(self) -> dict[str, Any]:
+        """A dictionary for ``json.dumps``."""
+        return {
+            "formula": self.formula,
+            "automaton_states": self.num_states,
+            "cut": self.cut,
+            "silent": self.silent,
+            **interval_to_json("success_rate", self.success_rate),
+            **interval_to_json("violation_rate", self.violation_rate),
+            **interval_to_json("steps_mean", self.steps_mean),
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class LtlResult:
+    """How an agent did on a suite.
+
+    Attributes:
+        suite: its name.
+        greedy: whether actions and sub-tasks were the most likely ones rather than sampled.
+        episodes: of each formula.
+        per_formula: the scores.
+    """
+
+    suite: str
+    greedy: bool
+    episodes: int
+    per_formula: tuple[FormulaScore, ...]
+
+    @property
+    def success_rate(self) -> float:
+        """Mean over formulas."""
+        return float(np.mean([score.success_rate.estimate for score in self.per_formula]))
+
+    @property
+    def steps_mean(self) -> float:
+        """Mean over the formulas with a success; NaN without any."""
+        steps = [score.steps_mean.estimate for score in self.per_formula if score.success_rate.estimate > 0]
+        return float(np.mean(steps)) if steps else float("nan")
+
+    def to_json(self) -> dict[str, Any]:
+        """A dictionary for ``json.dumps``."""
+        return {
+            "suite": self.suite,
+            "actions": "greedy" if self.greedy else "sampled",
+            "episodes_per_formula": self.episodes,
+            "success_rate": self.success_rate,
+            "steps_mean": None if np.isnan(self.steps_mean) else self.steps_mean,
+            "per_formula": [score.to_json() for score in self.per_formula],
+        }
+
+
+def ltl_suite(name: str, text: str, env: Environment, *, max_nodes: int = MAX_NODES) -> LtlSuite:
+    """Reads formulas, one a line; ``#`` begins a comment, blank lines are skipped.
+
+    Args:
+        name: of the suite, and of the text in errors.
+        text: the lines.
+        env: whose propositions they are about, and whose labels their automata read.
+        max_nodes: N, padded size of the trees that the states show.
+
+    Raises:
+        SpecError: with the line and column of the first mistake, if an automaton is too large, or without a formula.
+    """
+    formulas, automata = [], []
+    for number, line in enumerate(bare_lines(text), 1):
+        if not line.strip():
+            continue
+        try:
+            automata.append(to_automaton(parse_ltl(line), env.propositions, env.possible_labels))
+        except SpecError as error:
+            raise SpecError(error.message, number, error.column or 1, name) from None
+        formulas.append(" ".join(line.split()))
+    if not formulas:
+        raise SpecError("found no formula, expected one on each line", source=name)
+    together, cut, silent = automata_of(automata, env.propositions, max_nodes)
+    num_states = np.array([automaton.num_states for automaton in automata])
+    return LtlSuite(name, tuple(formulas), together, num_states, cut, silent)
+
+
+def evaluate_ltl(
+    key: Key[Array, ""],
+    agent: Agent,
+    params: Params,
+    machine: RewardMachine,
+    suite: LtlSuite,
+    *,
+    episodes: int = EPISODES,
+    seed: int = 0,
+    greedy: bool = False,
+    shield: bool = False,
+    chunk: int = EPISODES,
+) -> LtlResult:
+    """Success, violations and steps on each formula, in layouts that depend on ``seed`` alone.
+
+    Args:
+        key: of the agent's and the environment's randomness; consumed.
+        agent: the networks.
+        params: their parameters.
+        machine: the rewards.
+        suite: M formulas.
+        episodes: of each formula, each in a layout of its own.
+        seed: of the layouts.
+        greedy: take the most likely action and sub-task instead of sampling.
+        shield: replace actions that lead to propositions to be avoided.
+        chunk: episodes run in parallel; bounds memory.
+    """
+    which = np.repeat(np.arange(len(suite)), episodes)
+    layout_keys = jax.random.split(jax.random.key(seed), len(which))
+    layouts = jax.vmap(agent.env.sample_layout, in_axes=(0, None))(layout_keys, agent.env.default_params)
+    found = jax.device_get(
+        run_episodes(
+            key,
+            agent,
+            params,
+            machine,
+            suite.automata,
+            layouts,
+            which=which,
+            greedy=greedy,
+            shield=shield,
+            chunk=chunk,
+        )
+    )
+    success, violated, steps = np.asarray(found.success), np.asarray(found.violated), np.asarray(found.steps)
+    return LtlResult(suite.name, greedy, episodes, _scores(suite, which, success, violated, steps))
+
+
+def _scores(
+    suite: LtlSuite,
+    which: Int[np.ndarray, " B"],
+    success: Bool[np.ndarray, " B"],
+    violated: Bool[np.ndarray, " B"],
+    steps: Int[np.ndarray, " B"],
+) -> tuple[FormulaScore, ...]:
+    """The scores of each formula."""
+    rows: Sequence[Bool[np.ndarray, " B"]] = [which == number for number in range(len(suite))]
+    return tuple(
+        FormulaScore(
+            formula=formula,
+            num_states=int(suite.num_states[number]),
+            cut=bool(suite.cut[number]),
+            silent=bool(suite.silent[number]),
+            success_rate=rate_interval(success[mine]),
+            violation_rate=rate_interval(violated[mine]),
+            steps_mean=mean_interval(steps[mine & success]),
+        )
+        for number, (formula, mine) in enumerate(zip(suite.formulas, rows, strict=True))
+    )
