@@ -18,9 +18,14 @@ from hrlspec.methods import METHODS
 from hrlspec.presets import PRESETS, Recipe, preset
 from hrlspec.spec import TaskTree
 
-QUICK = {("letter", "hrlspec"), ("walk", "hrlspec"), ("zone", "hrlspec")}
+QUICK = {("letter", "hrlspec", method) for method in METHODS} | {
+    ("letter", "planner", "ours"),
+    ("walk", "hrlspec", "ours"),
+    ("zone", "hrlspec", "ours"),
+    ("zone", "hrlspec", "option"),
+}
 CASES = [
-    pytest.param(name, recipe, method, marks=() if (name, recipe) in QUICK else pytest.mark.slow)
+    pytest.param(name, recipe, method, marks=() if (name, recipe, method) in QUICK else pytest.mark.slow)
     for name in PRESETS
     for recipe in get_args(Recipe)
     for method in METHODS

@@ -126,6 +126,5 @@ def test_what_cannot_be_done_in_time_is_left_out() -> None:
     """In Letter there is an exact solver. Four letters cannot be reached within three steps."""
     letter = Letter(size=4, num_letters=5, num_cells=5, horizon=3)
     assert shortest(suite_of(letter).trees).max() <= 3
-    assert shortest(suite_of(dataclasses.replace(letter, horizon=100)).trees).max() == 4
     with pytest.raises(ValueError, match="none of 200 random tasks can be satisfied within 1 steps"):
         unseen_tasks(dataclasses.replace(letter, horizon=1), 0)
