@@ -57,6 +57,7 @@ class Outcome:
     node: Int32[Array, "*lead"]  # task node after: the edge that was taken, or the node before when none was
     edge_taken: Bool[Array, "*lead"]
     satisfied: Bool[Array, "*lead"]
+    accepted: Bool[Array, "*lead"]  # a round of a task that goes on for ever is complete
     reward: Float32[Array, "*lead"]
     terminated: Bool[Array, "*lead"]  # task satisfied or violated, or the environment ended the episode
     truncated: Bool[Array, "*lead"]  # horizon reached

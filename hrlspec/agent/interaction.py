@@ -175,12 +175,12 @@ def transition(
         keys, worker.env_state, action, params
     )
     labels = jax.vmap(env.labels, in_axes=(0, None))(env_state, params)
-    task, state, edge_taken, lost = _progress(book, worker, labels)
+    task, state, edge_taken, lost, accepted = _progress(book, worker, labels)
     satisfied = (state.status == SATISFIED) & edge_taken
     # An automaton does not say what it was that let it move: whatever holds.
     reached = labels if book.automata is not None else book.tree.reach[task, state.node]
     rules, reward = jax.vmap(rewards.step, in_axes=(None, 0, 0, 0, 0, 0))(
-        machine, worker.rules, labels, reached, edge_taken, satisfied
+        machine, worker.rules, labels, reached, edge_taken, satisfied | accepted
     )
     terminated = failed | (state.status != RUNNING)
     outcome = Outcome(
@@ -188,6 +188,7 @@ def transition(
         node=state.node,
         edge_taken=edge_taken,
         satisfied=satisfied,
+        accepted=accepted,
         reward=reward,
         terminated=terminated,
         truncated=truncated & ~terminated,
@@ -206,17 +207,19 @@ def transition(
 
 def _progress(
     book: TaskBook, worker: Worker, labels: Bool[Array, "E P"]
-) -> tuple[Int32[Array, " E"], TaskState, Bool[Array, " E"], Bool[Array, " E"]]:
-    """Rows of the book after one step, the tasks' states, whether they moved, whether the edge in force is lost."""
+) -> tuple[Int32[Array, " E"], TaskState, Bool[Array, " E"], Bool[Array, " E"], Bool[Array, " E"]]:
+    """Rows of the book after one step, and the tasks' states.
+
+    And whether they moved, whether the edge in force is lost, and whether a round of a task that goes on is complete.
+    """
     edge = worker.decision.edge
     if book.automata is None:
         state = jax.vmap(advance)(task_of(book, worker.task), worker.task_state, labels, edge)
         lost = jnp.take_along_axis(state.blocked, edge[:, None], 1)[:, 0]
-        return worker.task, state, state.node != worker.task_state.node, lost
-    task = jax.vmap(book.automata.advance)(worker.task, labels)
-    moved = task != worker.task
-    state = jax.vmap(initial)(task_of(book, task))
-    return task, dataclasses.replace(state, status=book.automata.status[task]), moved, jnp.zeros_like(moved)
+        return worker.task, state, state.node != worker.task_state.node, lost, jnp.zeros_like(lost)
+    task, accepted = jax.vmap(book.automata.advance)(worker.task, labels)
+    state = dataclasses.replace(jax.vmap(initial)(task_of(book, task)), status=book.automata.status[task])
+    return task, state, (task != worker.task) | accepted, jnp.zeros_like(accepted), accepted
 
 
 def _views(env: Environment, observation: Float32[Array, "E ..."]) -> View:

@@ -35,12 +35,14 @@ class Episodes:
         violated: bool ``[B]``, the task was violated, or the environment ended the episode.
         steps: int32 ``[B]``, environment steps until the episode ended.
         returns: float32 ``[B]``, undiscounted sum of rewards.
+        rounds: int32 ``[B]``, accepting transitions; 0 for tasks that do not go on for ever.
     """
 
     success: Bool[Array, " B"]
     violated: Bool[Array, " B"]
     steps: Int32[Array, " B"]
     returns: Float32[Array, " B"]
+    rounds: Int32[Array, " B"]
 
 
 @struct.dataclass
@@ -153,7 +155,8 @@ def _run(
     worker = start(keys, env, machine, book, layouts, rows)
     noise_scale = 0.0 if greedy else 1.0
     zeros = jnp.zeros(num_episodes, jnp.float32)
-    outcome = Episodes(success=zeros > 0, violated=zeros > 0, steps=zeros.astype(jnp.int32), returns=zeros)
+    none = zeros.astype(jnp.int32)
+    outcome = Episodes(success=zeros > 0, violated=zeros > 0, steps=none, returns=zeros, rounds=none)
 
     def step(carry: tuple[Any, ...]) -> tuple[tuple[Any, ...], Trace]:
         worker, outcome, running, time = carry
@@ -171,6 +174,7 @@ def _run(
             violated=outcome.violated | (running & result.terminated & ~result.satisfied),
             steps=outcome.steps + running,
             returns=outcome.returns + running * result.reward,
+            rounds=outcome.rounds + (running & result.accepted),
         )
         running &= ~(result.terminated | result.truncated)
         return (worker, outcome, running, time + 1), seen

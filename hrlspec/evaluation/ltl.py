@@ -17,12 +17,12 @@ from envs_jax import Environment
 from envs_jax.arrays import Array
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.low_level import Params
-from hrlspec.evaluation.episodes import run_episodes
+from hrlspec.evaluation.episodes import Episodes, run_episodes
 from hrlspec.evaluation.results import interval_to_json
 from hrlspec.evaluation.stats import Interval, mean_interval, rate_interval
 from hrlspec.spec import SpecError, bare_lines
 from hrlspec.spec.automata import Automata, automata_of
-from hrlspec.spec.ltl import parse_ltl, to_automaton
+from hrlspec.spec.ltl import parse_ltl, to_automaton, to_buchi
 from hrlspec.tasks.rewards import RewardMachine
 
 MAX_NODES = 64
@@ -37,6 +37,7 @@ class LtlSuite:
 
     Attributes:
         name: under which results are reported.
+        forever: whether the tasks go on for ever.
         formulas: their text.
         automata: the tasks for acting.
         num_states: int ``[M]``, of each automaton.
@@ -45,6 +46,7 @@ class LtlSuite:
     """
 
     name: str
+    forever: bool
     formulas: tuple[str, ...]
     automata: Automata
     num_states: Int[np.ndarray, " M"]
@@ -68,6 +70,7 @@ class FormulaScore:
         success_rate: of its episodes.
         violation_rate: nothing that could follow would have satisfied it, or the environment ended the episode.
         steps_mean: of the successful episodes.
+        rounds_mean: accepting transitions within the horizon; of tasks that go on for ever, which are never satisfied.
     """
 
     formula: str
@@ -77,6 +80,7 @@ class FormulaScore:
     success_rate: Interval
     violation_rate: Interval
     steps_mean: Interval
+    rounds_mean: Interval
 
     def to_json(self) -> dict[str, Any]:
         """A dictionary for ``json.dumps``."""
@@ -88,6 +92,7 @@ class FormulaScore:
             **interval_to_json("success_rate", self.success_rate),
             **interval_to_json("violation_rate", self.violation_rate),
             **interval_to_json("steps_mean", self.steps_mean),
+            **interval_to_json("rounds_mean", self.rounds_mean),
         }
 
 
@@ -97,12 +102,14 @@ class LtlResult:
 
     Attributes:
         suite: its name.
+        forever: whether the tasks go on for ever.
         greedy: whether actions and sub-tasks were the most likely ones rather than sampled.
         episodes: of each formula.
         per_formula: the scores.
     """
 
     suite: str
+    forever: bool
     greedy: bool
     episodes: int
     per_formula: tuple[FormulaScore, ...]
@@ -118,10 +125,17 @@ class LtlResult:
         steps = [score.steps_mean.estimate for score in self.per_formula if score.success_rate.estimate > 0]
         return float(np.mean(steps)) if steps else float("nan")
 
+    @property
+    def rounds_mean(self) -> float:
+        """Mean over formulas."""
+        return float(np.mean([score.rounds_mean.estimate for score in self.per_formula]))
+
     def to_json(self) -> dict[str, Any]:
         """A dictionary for ``json.dumps``."""
         return {
             "suite": self.suite,
+            "forever": self.forever,
+            "rounds_mean": self.rounds_mean if self.forever else None,
             "actions": "greedy" if self.greedy else "sampled",
             "episodes_per_formula": self.episodes,
             "success_rate": self.success_rate,
@@ -130,24 +144,27 @@ class LtlResult:
         }
 
 
-def ltl_suite(name: str, text: str, env: Environment, *, max_nodes: int = MAX_NODES) -> LtlSuite:
+def ltl_suite(name: str, text: str, env: Environment, *, forever: bool = False, max_nodes: int = MAX_NODES) -> LtlSuite:
     """Reads formulas, one a line; ``#`` begins a comment, blank lines are skipped.
 
     Args:
         name: of the suite, and of the text in errors.
         text: the lines.
         env: whose propositions they are about, and whose labels their automata read.
+        forever: whether they are to be satisfied for ever, instead of by the end of an episode; see
+            `hrlspec.spec.ltl.to_buchi`.
         max_nodes: N, padded size of the trees that the states show.
 
     Raises:
         SpecError: with the line and column of the first mistake, if an automaton is too large, or without a formula.
     """
+    translate = to_buchi if forever else to_automaton
     formulas, automata = [], []
     for number, line in enumerate(bare_lines(text), 1):
         if not line.strip():
             continue
         try:
-            automata.append(to_automaton(parse_ltl(line), env.propositions, env.possible_labels))
+            automata.append(translate(parse_ltl(line), env.propositions, env.possible_labels))
         except SpecError as error:
             raise SpecError(error.message, number, error.column or 1, name) from None
         formulas.append(" ".join(line.split()))
@@ -155,7 +172,7 @@ def ltl_suite(name: str, text: str, env: Environment, *, max_nodes: int = MAX_NO
         raise SpecError("found no formula, expected one on each line", source=name)
     together, cut, silent = automata_of(automata, env.propositions, max_nodes)
     num_states = np.array([automaton.num_states for automaton in automata])
-    return LtlSuite(name, tuple(formulas), together, num_states, cut, silent)
+    return LtlSuite(name, forever, tuple(formulas), together, num_states, cut, silent)
 
 
 def evaluate_ltl(
@@ -202,18 +219,14 @@ def evaluate_ltl(
             chunk=chunk,
         )
     )
-    success, violated, steps = np.asarray(found.success), np.asarray(found.violated), np.asarray(found.steps)
-    return LtlResult(suite.name, greedy, episodes, _scores(suite, which, success, violated, steps))
+    return LtlResult(suite.name, suite.forever, greedy, episodes, _scores(suite, which, found))
 
 
-def _scores(
-    suite: LtlSuite,
-    which: Int[np.ndarray, " B"],
-    success: Bool[np.ndarray, " B"],
-    violated: Bool[np.ndarray, " B"],
-    steps: Int[np.ndarray, " B"],
-) -> tuple[FormulaScore, ...]:
+def _scores(suite: LtlSuite, which: Int[np.ndarray, " B"], episodes: Episodes) -> tuple[FormulaScore, ...]:
     """The scores of each formula."""
+    success, violated, steps, rounds = map(
+        np.asarray, (episodes.success, episodes.violated, episodes.steps, episodes.rounds)
+    )
     rows: Sequence[Bool[np.ndarray, " B"]] = [which == number for number in range(len(suite))]
     return tuple(
         FormulaScore(
@@ -224,6 +237,7 @@ def _scores(
             success_rate=rate_interval(success[mine]),
             violation_rate=rate_interval(violated[mine]),
             steps_mean=mean_interval(steps[mine & success]),
+            rounds_mean=mean_interval(rounds[mine]),
         )
         for number, (formula, mine) in enumerate(zip(suite.formulas, rows, strict=True))
     )

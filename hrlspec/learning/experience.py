@@ -122,6 +122,7 @@ def copies(
             node=new.assigned,
             edge_taken=record.edge_taken & new.valid,
             satisfied=new.terminated,
+            accepted=jnp.zeros_like(new.valid),
             reward=new.reward,
             terminated=new.terminated | ~new.valid,
             truncated=jnp.zeros_like(new.valid),

@@ -57,23 +57,25 @@ def suite_table(result: SuiteResult) -> Table:
 def ltl_table(result: LtlResult) -> Table:
     """Success, violations and steps of each formula, and their means."""
     remarks = ["greedy actions" if result.greedy else "sampled actions", "95 % intervals over episodes"]
-    remarks.append("steps of successful episodes")
+    remarks.append("rounds within the horizon" if result.forever else "steps of successful episodes")
     if any(score.cut for score in result.per_formula):
         remarks.append("* some paths to acceptance were left out, for a tree was too small")
     if any(score.silent for score in result.per_formula):
         remarks.append("† some way on begins where nothing holds, which no sub-task asks for")
     table = plain_table(
         f"{result.suite} ({len(result.per_formula)} formulas, {result.episodes} episodes of each)",
-        ["formula", "success", "violated", "steps"],
+        ["formula", "rounds", "violated"] if result.forever else ["formula", "success", "violated", "steps"],
         "; ".join(remarks),
     )
     table.columns[0].no_wrap = False
     for score in result.per_formula:
         mark = "*" * score.cut + "†" * score.silent
-        rates = _cell(score.success_rate), f"{score.violation_rate.estimate:.3f}", _cell(score.steps_mean)
-        table.add_row(score.formula + mark, *rates)
+        violated = f"{score.violation_rate.estimate:.3f}"
+        finite = _cell(score.success_rate), violated, _cell(score.steps_mean)
+        table.add_row(score.formula + mark, *((_cell(score.rounds_mean), violated) if result.forever else finite))
     table.add_section()
-    table.add_row("mean", f"{result.success_rate:.3f}", "", f"{result.steps_mean:.1f}", style="bold")
+    finite = f"{result.success_rate:.3f}", "", f"{result.steps_mean:.1f}"
+    table.add_row("mean", *((f"{result.rounds_mean:.2f}",) if result.forever else finite), style="bold")
     return table
 
 

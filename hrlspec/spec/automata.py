@@ -35,6 +35,7 @@ class Automata:
         trees: what the agent is shown in each state, leading axis R.
         successors: int32 ``[R, L]``, the row that each label leads to.
         status: int32 ``[R]``, ``RUNNING``, ``SATISFIED`` or ``VIOLATED``.
+        accepts: bool ``[R, L]``, the accepting transitions of tasks that go on for ever.
         column: int32 ``[2^P]``, which label a set of propositions is, bit i for proposition i; -1 for one that cannot
             occur.
         start: int32 ``[M]``, the row where each task begins.
@@ -43,19 +44,25 @@ class Automata:
     trees: TaskTree
     successors: Int32[Array, "R L"]
     status: Int32[Array, " R"]
+    accepts: Bool[Array, "R L"]
     column: Int32[Array, " _"]
     start: Int32[Array, " M"]
 
-    def advance(self, row: Int32[Array, ""], labels: Bool[Array, " P"]) -> Int32[Array, ""]:
-        """The row after one step, int32 ``[]``; a set of propositions that cannot occur changes nothing.
+    def advance(self, row: Int32[Array, ""], labels: Bool[Array, " P"]) -> tuple[Int32[Array, ""], Bool[Array, ""]]:
+        """One step; a set of propositions that cannot occur changes nothing.
 
         Args:
             row: int32 ``[]``, where a task stands.
             labels: bool ``[P]``, the propositions that hold now.
+
+        Returns:
+            The row after it, and whether an accepting transition led there, bool ``[]``.
         """
         bits = 2 ** jnp.arange(labels.shape[0], dtype=jnp.int32)
         column = jnp.asarray(self.column)[(labels * bits).sum()]
-        return jnp.where(column >= 0, jnp.asarray(self.successors)[row, jnp.maximum(column, 0)], row)
+        known, at = column >= 0, (row, jnp.maximum(column, 0))
+        after = jnp.where(known, jnp.asarray(self.successors)[at], row)
+        return after, known & jnp.asarray(self.accepts)[at]
 
 
 def automata_of(
@@ -92,6 +99,9 @@ def automata_of(
         "trees": jax.tree.map(lambda *x: np.concatenate(x), *(one.trees for one in unfolded)),
         "successors": np.concatenate(successors).astype(np.int32),
         "status": status,
+        "accepts": np.concatenate(
+            [np.zeros(some.successors.shape, bool) if some.marks is None else some.marks for some in automata]
+        ),
         "column": _columns(labels, propositions),
         "start": start.astype(np.int32),
     }

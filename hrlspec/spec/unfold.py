@@ -1,6 +1,7 @@
 """From an automaton to task trees: what the agent is shown in each state.
 
-In a state q that is a tree rooted at q: useful simple paths to acceptance, shortest first. A move is useful unless
+In a state q that is a tree rooted at q: useful simple paths to acceptance (of a task that goes on for ever: to its next
+accepting transition), shortest first. A move is useful unless
 whatever is accepted after it would have been accepted without it. A sub-task's p₊ is the least that must hold for the
 automaton to move, its p₋ what takes the way on from it.
 
@@ -62,7 +63,7 @@ def unfold(automaton: Automaton, propositions: Sequence[str], max_nodes: int) ->
         propositions: names of the P propositions.
         max_nodes: N, padded size of the trees.
     """
-    moves = _Moves(automaton)
+    moves = _Moves(automaton if automaton.marks is None else _until_accepting(automaton, automaton.marks))
     rows, cut = [], []
     for state in range(automaton.num_states):
         nodes, complete = _paths(moves, state, max_nodes)
@@ -70,6 +71,14 @@ def unfold(automaton: Automaton, propositions: Sequence[str], max_nodes: int) ->
         cut.append(not complete)
     trees: TaskTree = jax.tree.map(lambda *x: np.stack(x), *rows)
     return Unfolded(trees, np.array(cut), np.array([moves.silent(state) for state in range(automaton.num_states)]))
+
+
+def _until_accepting(automaton: Automaton, marks: Bool[np.ndarray, "Q L"]) -> Automaton:
+    """Where a task that goes on for ever has a round to complete: its accepting transitions lead to one more state."""
+    accepting = automaton.num_states
+    successors = np.where(marks, accepting, automaton.successors)
+    successors = np.vstack([successors, np.full_like(successors[:1], accepting)])
+    return Automaton(automaton.labels, successors.astype(np.int32), accepting, automaton.rejecting)
 
 
 class _Moves:

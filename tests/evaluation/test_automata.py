@@ -12,7 +12,7 @@ import pytest
 import envs_jax
 from hrlspec.evaluation import evaluate_ltl, ltl_suite, run_episodes
 from hrlspec.evaluation.episodes import trace_episodes
-from hrlspec.presets.peers import peer_formulas, peer_suites
+from hrlspec.presets.peers import go_on_for_ever, peer_formulas, peer_suites
 from hrlspec.spec import compile_task, parse
 from hrlspec.spec.automata import Automata, automata_of
 from hrlspec.spec.ltl import parse_ltl, satisfies_ltl, to_automaton
@@ -92,6 +92,26 @@ def test_tasks_of_any_size_in_one_program() -> None:
         run_episodes(KEY, WALKER, manner(), COMPLETION, together, some, which=np.full(9, 3), **how)
 
 
+def test_rounds_of_a_task_that_goes_on() -> None:
+    """a, then b, then a again: counted from what the agent stepped on. It ends with the horizon, satisfied or not."""
+    suite = ltl_suite("some", "GF a & GF b", LETTER, forever=True)
+    some = layouts(16, seed=7)
+    which = np.zeros(16, int)
+    episodes, trace = trace_episodes(KEY, WALKER, manner(), COMPLETION, suite.automata, some, which=which, greedy=True)
+    labels = np.asarray(jax.vmap(jax.vmap(lambda state: LETTER.labels(state, LETTER.default_params)))(trace.env_state))
+    assert np.asarray(episodes.steps).tolist() == [LETTER.horizon] * 16
+    assert not np.asarray(episodes.success).any()
+    for episode in range(16):
+        wanted, rounds = 0, 0
+        for step in range(1, LETTER.horizon):  # what the last step led to is not in the trace
+            if labels[step, episode, wanted]:
+                wanted, rounds = 1 - wanted, rounds + wanted
+        assert int(episodes.rounds[episode]) - rounds in (0, 1)
+        assert rounds > 3
+    found = evaluate_ltl(KEY, WALKER, manner(), COMPLETION, suite, episodes=16, greedy=True)
+    assert found.to_json()["rounds_mean"] == found.rounds_mean > 3
+
+
 def test_a_suite_of_formulas() -> None:
     """One that nothing satisfies, one that is satisfied at once, and one with a bad end that is avoided."""
     text = "# formulas\nfalse\nF (a | b | c | d | e | !a)\n\n!a U b  # clear of a\n"
@@ -112,8 +132,8 @@ def test_a_suite_of_formulas() -> None:
 def test_published_formulas_can_be_carried_out(name: str) -> None:
     """In their world, whose labels are the peers'; nothing asks for a step on which nothing holds."""
     env = envs_jax.make("flatworld" if "flatworld" in name else "letter12")
-    suite = ltl_suite(name, peer_formulas(name), env)
-    assert len(suite) in (5, 8, 10, 49, 50)
+    suite = ltl_suite(name, peer_formulas(name), env, forever=go_on_for_ever(name))
+    assert len(suite) in (2, 3, 5, 8, 10, 49, 50)
     assert not suite.silent.any()
     starts = np.asarray(suite.automata.start)
     assert (np.asarray(suite.automata.trees.valid)[starts].sum(-1) > 1).all()

@@ -49,6 +49,8 @@ BAD_FLAGS: list[tuple[Sequence[str], str]] = [
     (("--run", "run", "--ltl", "F z"), "'z' is no proposition, expected some of a, b, c, d, e"),
     (("--run", "run", "--ltl", "a => b & c"), "line 1"),
     (("--run", "run", "--ltl", "F a"), "no checkpoint in run"),
+    (("--run", "run", "--ltl", "FG a", "--forever"), "F G a asks to stay for ever"),
+    (("--run", "run", "--suite", "dag", "--forever"), "--forever goes with --ltl or --ltl-file"),
     (("--run", "run", "--ltl-file", "nothing.txt"), "cannot read nothing.txt: No such file"),
     (("--run", "run", "--ltl-file", "binary"), "binary: not UTF-8"),
     (("--run", "run", "--ltl-file", "empty"), "found no formula"),

@@ -14,6 +14,11 @@ def peer_suites() -> tuple[str, ...]:
     return tuple(f"{file.parent.name}/{file.stem}" for file in sorted(FOLDER.glob("*/*.txt")))
 
 
+def go_on_for_ever(name: str) -> bool:
+    """Whether the formulas of a published suite are meant for ever, and not to be satisfied by an episode's end."""
+    return name.endswith("_infinite")
+
+
 def peer_formulas(name: str) -> str:
     """Text with one formula a line.
 

@@ -22,7 +22,7 @@ from hrlspec.config import Checked, setting
 from hrlspec.evaluation import LtlResult, LtlSuite, Suite, SuiteResult, evaluate_ltl, ltl_suite, suite_from_text
 from hrlspec.evaluation.ltl import MAX_NODES as LTL_NODES
 from hrlspec.evaluation.suite import MAX_NODES
-from hrlspec.presets.peers import peer_formulas
+from hrlspec.presets.peers import go_on_for_ever, peer_formulas
 from hrlspec.run import platform
 from hrlspec.run.console import result_console
 from hrlspec.run.errors import UserError
@@ -56,6 +56,9 @@ class EvaluateFlags(Checked):
     """A task in linear temporal logic, such as "F (a & (!b U c))", to be satisfied by the end of the episode."""
     ltl_file: Path | None = None
     """A file with one such formula a line."""
+    forever: bool = False
+    """Count how often a formula's accepting transitions are taken, instead of asking whether it is satisfied in the
+    end. Published suites know it of themselves."""
     suite: str | None = None
     """A suite of the run's environment, such as dag, or published formulas, such as jaxolotl/letter_finite."""
     episodes: int = setting(500, least=1, most=1_000_000)
@@ -171,14 +174,15 @@ def formulas_of(flags: EvaluateFlags, experiment: Experiment) -> LtlSuite | None
         SpecError: a formula cannot be read, or its automaton is too large.
     """
     if flags.ltl is not None:
-        name, text = "--ltl", " ".join(bare_lines(flags.ltl))
+        name, text, forever = "--ltl", " ".join(bare_lines(flags.ltl)), flags.forever
     elif flags.ltl_file is not None:
-        name, text = flags.ltl_file.name, _read(flags.ltl_file)
+        name, text, forever = flags.ltl_file.name, _read(flags.ltl_file), flags.forever
     elif flags.suite is not None and "/" in flags.suite:
-        name, text = flags.suite, peer_formulas(flags.suite)
+        name, text, forever = flags.suite, peer_formulas(flags.suite), go_on_for_ever(flags.suite)
     else:
         return None
-    return ltl_suite(name, text, experiment.preset.make(), max_nodes=min(flags.max_nodes, LTL_NODES))
+    env, max_nodes = experiment.preset.make(), min(flags.max_nodes, LTL_NODES)
+    return ltl_suite(name, text, env, forever=forever, max_nodes=max_nodes)
 
 
 def tasks_of(flags: EvaluateFlags, experiment: Experiment) -> Suite:
@@ -216,6 +220,8 @@ def _check(flags: EvaluateFlags) -> None:
         found = " and ".join(f"--{name.replace('_', '-')}" for name in given) or "none"
         flags_there_are = ", ".join(f"--{name.replace('_', '-')}" for name in _TASKS[:-1])
         raise UserError(f"expected exactly one of {flags_there_are} and --suite, found {found}")
+    if flags.forever and flags.ltl is None and flags.ltl_file is None:
+        raise UserError("--forever goes with --ltl or --ltl-file")
     if flags.draw is not None and not (flags.spec or flags.spec_file) and (flags.ltl or flags.ltl_file):
         raise UserError("--draw takes tasks in SPECTRL, not in LTL")
     if flags.draw is not None and flags.draw.suffix not in (".png", ".svg"):

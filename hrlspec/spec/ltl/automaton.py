@@ -7,7 +7,7 @@ import functools
 from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
-from jaxtyping import Int32
+from jaxtyping import Bool, Int32
 
 from hrlspec.spec.monitor import RUNNING, SATISFIED, VIOLATED
 
@@ -16,6 +16,8 @@ from hrlspec.spec.monitor import RUNNING, SATISFIED, VIOLATED
 class Automaton:
     """States 0 to Q - 1, of which 0 is where a trace begins; what has been accepted or rejected stays so.
 
+    Of a task that goes on for ever accepting transitions count, and no state is accepting.
+
     Axes: **Q** states, **L** labels.
 
     Attributes:
@@ -23,12 +25,14 @@ class Automaton:
         successors: int32 ``[Q, L]``, the state that each label leads to.
         accepting: the state in which the task is satisfied; ``None`` if it can never be.
         rejecting: the state from which it cannot be satisfied any more; ``None`` if there is none.
+        marks: bool ``[Q, L]``, the accepting transitions of a task that goes on for ever; else ``None``.
     """
 
     labels: tuple[frozenset[str], ...]
     successors: Int32[np.ndarray, "Q L"]
     accepting: int | None
     rejecting: int | None
+    marks: Bool[np.ndarray, "Q L"] | None = None
 
     @property
     def num_states(self) -> int:

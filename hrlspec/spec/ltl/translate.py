@@ -26,7 +26,7 @@ MAX_FREE = 12
 
 Remainder: TypeAlias = frozenset[int]
 """What is left: alternatives, each a set of obligations as bits of an integer."""
-_TRUE: Remainder = frozenset({0})
+NOTHING_OWED: Remainder = frozenset({0})
 _FALSE: Remainder = frozenset()
 
 _Term: TypeAlias = tuple[str | int, ...]
@@ -49,6 +49,21 @@ def to_automaton(
         SpecError: the formula names other propositions, or its automaton is too large; the message says how large.
         ValueError: a possible label names other propositions, or there is none.
     """
+    labels, distinct, columns = labels_of(formula, propositions, possible_labels)
+    successors = _explore(Progression(distinct), formula)
+    successors, accepting, rejecting = _minimal(successors)
+    return Automaton(labels, successors[:, columns], accepting, rejecting)
+
+
+def labels_of(
+    formula: Formula, propositions: Sequence[str], possible_labels: Iterable[Collection[str]] | None
+) -> tuple[tuple[frozenset[str], ...], list[frozenset[str]], list[int]]:
+    """The possible labels, those that the formula tells apart, and which of these each of the former is.
+
+    Raises:
+        SpecError: the formula names other propositions, or too many to try all combinations.
+        ValueError: a possible label names other propositions, or there is none.
+    """
     used = propositions_of(formula)
     for name in used:
         if name not in propositions:
@@ -57,10 +72,7 @@ def to_automaton(
     # What the formula does not name makes no difference: labels that differ in nothing else share their successors.
     seen = [label & frozenset(used) for label in labels]
     distinct = list(dict.fromkeys(seen))
-    successors = _explore(_Progression(distinct), formula)
-    successors, accepting, rejecting = _minimal(successors)
-    columns = [distinct.index(label) for label in seen]
-    return Automaton(labels, successors[:, columns], accepting, rejecting)
+    return labels, distinct, [distinct.index(label) for label in seen]
 
 
 def _labels(
@@ -82,7 +94,7 @@ def _labels(
     return labels
 
 
-class _Progression:
+class Progression:
     """Terms, their progression by labels, and what is left of them."""
 
     def __init__(self, labels: Sequence[frozenset[str]]) -> None:
@@ -187,7 +199,8 @@ class _Progression:
     def _either(self, first: Remainder, second: Remainder) -> Remainder:
         return self._minimise(first | second)
 
-    def _both(self, first: Remainder, second: Remainder) -> Remainder:
+    def both(self, first: Remainder, second: Remainder) -> Remainder:
+        """All that either owes."""
         self._spend(len(first) * len(second))
         return self._minimise([x | y for x in first for y in second])
 
@@ -198,10 +211,10 @@ class _Progression:
         """What is left of obligations that are all owed."""
         key = clause, label
         if key not in self._clauses:
-            result = _TRUE
+            result = NOTHING_OWED
             for number, term in enumerate(self._obligations):
                 if clause >> number & 1:
-                    result = self._both(result, self._step(term, label))
+                    result = self.both(result, self._step(term, label))
             self._clauses[key] = result
         return self._clauses[key]
 
@@ -214,29 +227,29 @@ class _Progression:
 
     def _stepped(self, kind: str | int, *operands: str | int, label: int) -> Remainder:
         if kind in ("is", "not"):
-            return _TRUE if (operands[0] in self.labels[label]) == (kind == "is") else _FALSE
+            return NOTHING_OWED if (operands[0] in self.labels[label]) == (kind == "is") else _FALSE
         if kind in ("true", "false"):
-            return _TRUE if kind == "true" else _FALSE
+            return NOTHING_OWED if kind == "true" else _FALSE
         terms = [operand for operand in operands if isinstance(operand, int)]
         if kind in ("next", "weak next"):
             return self._owed("some" if kind == "next" else "any", *terms)
         left = [self._step(term, label) for term in terms]
         if kind == "until":
-            return self._either(left[1], self._both(left[0], self._owed("until", *terms)))
+            return self._either(left[1], self.both(left[0], self._owed("until", *terms)))
         if kind == "release":
-            return self._both(left[1], self._either(left[0], self._owed("release", *terms)))
+            return self.both(left[1], self._either(left[0], self._owed("release", *terms)))
         result = left[0]
         for other in left[1:]:
-            result = self._both(result, other) if kind == "and" else self._either(result, other)
+            result = self.both(result, other) if kind == "and" else self._either(result, other)
         return result  # "some" and "any" differ only when no step is left
 
 
-def _explore(progression: _Progression, formula: Formula) -> np.ndarray:
+def _explore(progression: Progression, formula: Formula) -> np.ndarray:
     """Successors int ``[Q, L]`` of all states that can be reached; 0 is the initial state, 1 the accepting one."""
     num_labels = len(progression.labels)
     start = progression.start(formula)
     numbers, rows = {start: 0}, [[0] * num_labels, [1] * num_labels]
-    states = [start, _TRUE]
+    states = [start, NOTHING_OWED]
     at = 0
     while at < len(states):
         if at != 1:
