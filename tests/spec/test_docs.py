@@ -1,13 +1,15 @@
-"""The examples of docs/semantics.md and docs/language.md."""
+"""The examples of docs/semantics.md, docs/language.md and docs/tasks.md."""
 
 from __future__ import annotations
 
+import itertools
 import re
 from pathlib import Path
 
 import jax.numpy as jnp
 import pytest
 
+from hrlspec.presets.peers import peer_suites
 from hrlspec.spec import (
     RUNNING,
     SATISFIED,
@@ -25,6 +27,7 @@ from hrlspec.spec import (
     syntax,
     task_hash,
 )
+from hrlspec.spec.ltl import parse_ltl, satisfies_ltl, to_automaton, to_buchi
 from tests.spec.tasks import NAMES
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -97,3 +100,46 @@ def test_limits_are_as_written() -> None:
         compiler.MAX_NODES,
     ]
     assert [int(number.replace(",", "")) for number in table] == expected
+
+
+# --- docs/tasks.md ---
+
+LABELS = [frozenset(some) for size in range(4) for some in itertools.combinations("abcd", size)]
+STATUS = {RUNNING: "running", SATISFIED: "satisfied", VIOLATED: "violated"}
+
+
+def _split(line: str) -> tuple[list[set[str]], str]:
+    """The trace and what is said of it."""
+    before, _, after = line.partition("->")
+    return [set(re.findall(r"\w", label)) for label in re.findall(r"\{(.*?)\}", before)], after.strip()
+
+
+@pytest.mark.parametrize("lines", _blocks("tasks.md", "ltl"), ids=" | ".join)
+def test_a_formula_means_what_the_page_says(lines: list[str]) -> None:
+    formula, (trace, said) = parse_ltl(lines[0]), _split(lines[1])
+    assert STATUS[to_automaton(formula, "abcd", LABELS).run(trace)] == said
+    assert satisfies_ltl(formula, trace) == (said == "satisfied")
+
+
+@pytest.mark.parametrize("lines", _blocks("tasks.md", "forever"), ids=" | ".join)
+def test_rounds_are_as_many_as_the_page_says(lines: list[str]) -> None:
+    automaton, (trace, said) = to_buchi(parse_ltl(lines[0]), "abcd", LABELS), _split(lines[1])
+    assert automaton.marks is not None
+    state = rounds = 0
+    for label in trace:
+        column = automaton.labels.index(frozenset(label))
+        rounds += bool(automaton.marks[state, column])
+        state = int(automaton.successors[state, column])
+    assert str(rounds) == said
+
+
+@pytest.mark.parametrize("lines", _blocks("tasks.md", "twins"), ids=" | ".join)
+def test_twins_agree_and_differ_where_the_page_says(lines: list[str]) -> None:
+    (text, _, ltl), (trace, said) = lines[0].partition(" | "), _split(lines[1])
+    automaton = to_automaton(parse_ltl(ltl), "abcd", LABELS)
+    assert f"{_monitor(text, trace)}, {STATUS[automaton.run(trace)]}" == said
+
+
+def test_the_page_names_all_published_suites() -> None:
+    page = (DOCS / "tasks.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"`(\w+/\w+_\w+)`", page)) == set(peer_suites())
