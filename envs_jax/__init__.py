@@ -59,6 +59,12 @@ def _zone(name: str, **overrides: Any) -> Environment:
     return PRESETS[name](**overrides)
 
 
+def _point_mass(name: str, **overrides: Any) -> Environment:
+    from envs_jax.zone.point_mass import PRESETS
+
+    return PRESETS[name](**overrides)
+
+
 _REGISTRY: dict[str, Callable[..., Environment]] = {
     "letter": functools.partial(Letter, name="letter"),
     "letter12": functools.partial(Letter, name="letter12", num_letters=12, num_cells=24),
@@ -67,6 +73,8 @@ _REGISTRY: dict[str, Callable[..., Environment]] = {
     "zone": functools.partial(_zone, "zone"),
     "zone-ltl2action": functools.partial(_zone, "zone-ltl2action"),
     "zone-nm": functools.partial(_zone, "zone-nm"),
+    "zone-jaxolotl": functools.partial(_point_mass, "zone-jaxolotl"),
+    "zone-nm-jaxolotl": functools.partial(_point_mass, "zone-nm-jaxolotl"),
 }
 
 

@@ -37,7 +37,8 @@ def _adam(eps: float, b1: float = 0.9, b2: float = 0.999) -> optax.GradientTrans
     def update(gradient: Any, state: optax.OptState, params: Any = None) -> tuple[Any, optax.OptState]:
         del params
         count = state.count + 1
-        first, second = 1.0 - b1**count, jnp.sqrt(1.0 - b2**count)
+        first, second = (1.0 - jnp.float32(decay) ** count.astype(jnp.float32) for decay in (b1, b2))
+        second = jnp.sqrt(second)
         mu = jax.tree.map(lambda g, m: b1 * m + (1.0 - b1) * g, gradient, state.mu)
         nu = jax.tree.map(lambda g, v: b2 * v + (1.0 - b2) * g * g, gradient, state.nu)
         step = jax.tree.map(lambda m, v: second / first * m / (jnp.sqrt(v) + second * eps), mu, nu)

@@ -7,12 +7,23 @@ from hrlspec.presets.letter import LETTER, LETTER12
 from hrlspec.presets.preset import Preset, Split
 from hrlspec.presets.recipes import RECIPES, Recipe, RewardSet
 from hrlspec.presets.walk import FLATWORLD, WALK
-from hrlspec.presets.zone import ZONE, ZONE_LTL2ACTION, ZONE_NM
+from hrlspec.presets.zone import ZONE, ZONE_JAXOLOTL, ZONE_LTL2ACTION, ZONE_NM, ZONE_NM_JAXOLOTL
 
 __all__ = ["PRESETS", "RECIPES", "Preset", "Recipe", "RewardSet", "Split", "preset", "preset_for"]
 
 PRESETS: dict[str, Preset] = {
-    some.name: some for some in (LETTER, LETTER12, WALK, FLATWORLD, ZONE, ZONE_LTL2ACTION, ZONE_NM)
+    some.name: some
+    for some in (
+        LETTER,
+        LETTER12,
+        WALK,
+        FLATWORLD,
+        ZONE,
+        ZONE_LTL2ACTION,
+        ZONE_NM,
+        ZONE_JAXOLOTL,
+        ZONE_NM_JAXOLOTL,
+    )
 }
 """The presets by name."""
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 import envs_jax
+from envs_jax.zone import point_mass
 from envs_jax.zone.layouts import COLOURS
 from hrlspec.presets.preset import Preset
 from hrlspec.presets.recipes import Recipe, Settings, continuous, once, twice
@@ -79,9 +80,6 @@ _LEARNING_RATES: dict[tuple[Recipe, str], float] = {
 }
 
 
-_BLUE, _GREEN = (COLOURS.index(colour) for colour in ("blue", "green"))
-
-
 def _ways(tasks: TaskTree, first: int, second: int) -> tuple[np.ndarray, np.ndarray]:
     """How many ways to satisfy each task there are, and how many reach ``second`` after ``first``; int ``[M]``."""
     parent, reach = np.asarray(tasks.parent), np.asarray(tasks.reach)
@@ -95,36 +93,42 @@ def _ways(tasks: TaskTree, first: int, second: int) -> tuple[np.ndarray, np.ndar
     return ends.sum(-1), (ends & spoilt).sum(-1)
 
 
-def _possible(tasks: TaskTree) -> np.ndarray:
-    """Whether some way to satisfy the task leaves green before blue makes it vanish, bool ``[M]``."""
-    ways, spoilt = _ways(tasks, _BLUE, _GREEN)
-    return (shortest(tasks) >= 2) & (spoilt < ways)
-
-
-def _order_matters(tasks: TaskTree) -> np.ndarray:
-    """Whether besides that some other way asks for green after blue, bool ``[M]``."""
-    return _possible(tasks) & (_ways(tasks, _BLUE, _GREEN)[1] > 0)
-
-
 _DAG = random_trees(2, 3)
-_NM_DAG = dataclasses.replace(
-    _DAG, about=f"{_DAG.about}, and at least one way asks for no green after blue", keep=_possible
-)
-_NM_ORDER = dataclasses.replace(
-    _DAG,
-    about=f"{_NM_DAG.about}, but some other way does, where no green is left",
-    draws=tuple(trees(depth, num_drawn=16 * NUM_TASKS) for depth in (2, 3)),
-    keep=_order_matters,
-)
 
 
-def _preset(name: str, suites: Mapping[str, SuiteRule]) -> Preset:
+def _where_one_vanishes(colours: Sequence[str], first: str, second: str) -> dict[str, SuiteRule]:
+    """Suites of a world where touching one colour makes another vanish.
+
+    Some way to satisfy a task asks for it before that; in suite ``order`` some other way asks for it afterwards.
+    """
+    pair = colours.index(first), colours.index(second)
+
+    def possible(tasks: TaskTree) -> np.ndarray:
+        ways, spoilt = _ways(tasks, *pair)
+        return (shortest(tasks) >= 2) & (spoilt < ways)
+
+    def order_matters(tasks: TaskTree) -> np.ndarray:
+        return possible(tasks) & (_ways(tasks, *pair)[1] > 0)
+
+    dag = dataclasses.replace(
+        _DAG, about=f"{_DAG.about}, and at least one way asks for no {second} after {first}", keep=possible
+    )
+    order = dataclasses.replace(
+        _DAG,
+        about=f"{dag.about}, but some other way does, where no {second} is left",
+        draws=tuple(trees(depth, num_drawn=16 * NUM_TASKS) for depth in (2, 3)),
+        keep=order_matters,
+    )
+    return {"dag": dag, "order": order}
+
+
+def _preset(name: str, suites: Mapping[str, SuiteRule], bonuses: tuple[Bonus, ...] = _BONUSES) -> Preset:
     return Preset(
         name,
         functools.partial(envs_jax.make, name),
         zone,
         zone_with_bonuses,
-        bonuses=_BONUSES,
+        bonuses=bonuses,
         learning_rates=_LEARNING_RATES,
         suites=with_validation(suites),
     )
@@ -132,4 +136,10 @@ def _preset(name: str, suites: Mapping[str, SuiteRule]) -> Preset:
 
 ZONE = _preset("zone", {"dag": _DAG, "reach_avoid": REACH_AVOID, "reach": REACH})
 ZONE_LTL2ACTION = _preset("zone-ltl2action", {"dag": _DAG})
-ZONE_NM = _preset("zone-nm", {"dag": _NM_DAG, "order": _NM_ORDER})
+ZONE_NM = _preset("zone-nm", _where_one_vanishes(COLOURS, "blue", "green"))
+# The paper's rules are about blue, which is purple here.
+_POINT_MASS_BONUSES = (Bonus("green", "red", 10.0), Bonus("red", "purple", 20.0, ("yellow",)))
+ZONE_JAXOLOTL = _preset("zone-jaxolotl", {"dag": _DAG}, _POINT_MASS_BONUSES)
+ZONE_NM_JAXOLOTL = _preset(
+    "zone-nm-jaxolotl", _where_one_vanishes(point_mass.COLOURS, "purple", "green"), _POINT_MASS_BONUSES
+)

@@ -18,7 +18,7 @@ from envs_jax.rooms.world import Rooms
 NUM = 8
 ONE_LAYOUT = {"walk"}
 """Environments that show only a position: regions stay where they are, and so does the start."""
-MAY_FAIL = {"flatworld", "zone", "zone-nm"}
+MAY_FAIL = {"flatworld", "zone", "zone-nm", "zone-jaxolotl", "zone-nm-jaxolotl"}
 """Environments whose episodes end where the square does."""
 
 

@@ -67,7 +67,7 @@ def trains_in_single_precision(agent: Agent, rewards: Any) -> None:
     with jax.enable_x64(True):
         init, first = jax.make_jaxpr(trainer.init, return_shape=True)(jax.random.key(0), bank, rewards)
         iterate, (after, metrics) = jax.make_jaxpr(trainer.iterate, return_shape=True)(state, bank, rewards, reserved)
-        episodes = jax.make_jaxpr(lambda *x: evaluate(x[0], params=x[1], trees=x[2], layouts=x[3]))(
+        episodes = jax.make_jaxpr(lambda *x: evaluate(x[0], params=x[1], tasks=x[2], layouts=x[3]))(
             jax.random.key(0), state.params, bank, layouts
         )
     assert dtypes(first) == dtypes(after) == dtypes(state)
