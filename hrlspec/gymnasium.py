@@ -1,6 +1,7 @@
-"""Gymnasium environments whose task is SPECTRL text.
+"""Gymnasium environments whose task is text: SPECTRL, or a formula in LTL.
 
-``env = hrlspec.gymnasium.make("letter"); env.reset(seed=0, options={"task": "achieve a; achieve b"})``.
+``env = hrlspec.gymnasium.make("letter"); env.reset(seed=0, options={"task": "achieve a; achieve b"})``;
+``env = hrlspec.gymnasium.make("letter", language="ltl", task="F (a & F b)")``.
 
 Importing this module makes every preset known to ``gymnasium.make`` and ``gymnasium.make_vec`` by an id such as
 ``hrlspec/letter-v0``; ``gymnasium.make("hrlspec.gymnasium:hrlspec/letter-v0")`` imports it by itself.
@@ -9,18 +10,22 @@ Importing this module makes every preset known to ``gymnasium.make`` and ``gymna
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal, get_args
 
 import envs_jax
 from envs_jax import Environment
 from envs_jax.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
+from hrlspec.tasks.ltl_tasks import LtlTasks
 from hrlspec.tasks.text_tasks import TextTasks
+
+Language = Literal["spectrl", "ltl", "ltl forever"]
 
 
 def make(
     env: str | Environment,
     *,
     task: str | None = None,
+    language: Language = "spectrl",
     max_nodes: int = 64,
     render_mode: None = None,
     **overrides: Any,
@@ -30,7 +35,9 @@ def make(
     Args:
         env: an environment, or a name that `envs_jax.make` knows.
         task: the task until ``reset(options={"task": ...})`` gives another.
-        max_nodes: the largest task tree that can be given.
+        language: what tasks are written in: ``"spectrl"``, ``"ltl"`` (to be satisfied by the end of the episode) or
+            ``"ltl forever"`` (a reward for each round).
+        max_nodes: the largest task tree that can be given, or the most states of an automaton.
         render_mode: none but ``None``, which makers of environments pass.
         **overrides: sizes that differ from the preset's, for example ``size=9``.
 
@@ -39,7 +46,7 @@ def make(
         TypeError: if it is to be rendered.
     """
     world = _world(env, render_mode, overrides)
-    return GymnasiumEnv(world, TextTasks(world.propositions, max_nodes), task=task)
+    return GymnasiumEnv(world, _tasks(world, language, max_nodes), task=task)
 
 
 def make_vec(
@@ -47,13 +54,14 @@ def make_vec(
     num_envs: int,
     *,
     task: str | Sequence[str] | None = None,
+    language: Language = "spectrl",
     max_nodes: int = 64,
     render_mode: None = None,
     **overrides: Any,
 ) -> GymnasiumVectorEnv:
     """Many environments side by side; a task for all of them or one for each, see :func:`make`."""
     world = _world(env, render_mode, overrides)
-    return GymnasiumVectorEnv(world, num_envs, TextTasks(world.propositions, max_nodes), task=task)
+    return GymnasiumVectorEnv(world, num_envs, _tasks(world, language, max_nodes), task=task)
 
 
 def register(namespace: str = "hrlspec") -> tuple[str, ...]:
@@ -75,6 +83,14 @@ def register(namespace: str = "hrlspec") -> tuple[str, ...]:
                 kwargs={"env": name},
             )
     return tuple(ids)
+
+
+def _tasks(world: Environment, language: Language, max_nodes: int) -> TextTasks | LtlTasks:
+    if language not in get_args(Language):
+        raise ValueError(f"unknown language {language!r}, expected one of: {', '.join(get_args(Language))}")
+    if language == "spectrl":
+        return TextTasks(world.propositions, max_nodes)
+    return LtlTasks(world.propositions, world.possible_labels, language == "ltl forever", max_nodes)
 
 
 def _world(env: str | Environment, render_mode: None, overrides: dict[str, Any]) -> Environment:

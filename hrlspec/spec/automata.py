@@ -49,20 +49,33 @@ class Automata:
     start: Int32[Array, " M"]
 
     def advance(self, row: Int32[Array, ""], labels: Bool[Array, " P"]) -> tuple[Int32[Array, ""], Bool[Array, ""]]:
-        """One step; a set of propositions that cannot occur changes nothing.
+        """See `advance`."""
+        return advance(self.successors, self.accepts, self.column, row, labels)
 
-        Args:
-            row: int32 ``[]``, where a task stands.
-            labels: bool ``[P]``, the propositions that hold now.
 
-        Returns:
-            The row after it, and whether an accepting transition led there, bool ``[]``.
-        """
-        bits = 2 ** jnp.arange(labels.shape[0], dtype=jnp.int32)
-        column = jnp.asarray(self.column)[(labels * bits).sum()]
-        known, at = column >= 0, (row, jnp.maximum(column, 0))
-        after = jnp.where(known, jnp.asarray(self.successors)[at], row)
-        return after, known & jnp.asarray(self.accepts)[at]
+def advance(
+    successors: Int32[Array, "R L"],
+    accepts: Bool[Array, "R L"],
+    column: Int32[Array, " _"],
+    row: Int32[Array, ""],
+    labels: Bool[Array, " P"],
+) -> tuple[Int32[Array, ""], Bool[Array, ""]]:
+    """One step; a set of propositions that cannot occur changes nothing.
+
+    Args:
+        successors: see `Automata`.
+        accepts: see `Automata`.
+        column: see `Automata`.
+        row: int32 ``[]``, where a task stands.
+        labels: bool ``[P]``, the propositions that hold now.
+
+    Returns:
+        The row after it, and whether an accepting transition led there, bool ``[]``.
+    """
+    bits = 2 ** jnp.arange(labels.shape[0], dtype=jnp.int32)
+    label = jnp.asarray(column)[(labels * bits).sum(dtype=jnp.int32)]
+    known, at = label >= 0, (row, jnp.maximum(label, 0))
+    return jnp.where(known, jnp.asarray(successors)[at], row), known & jnp.asarray(accepts)[at]
 
 
 def automata_of(

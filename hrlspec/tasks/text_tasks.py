@@ -135,12 +135,12 @@ def _subtasks(text: str, propositions: tuple[str, ...], max_nodes: int) -> tuple
     """For each valid node of a task its edges: where they lead, and the sub-task as text."""
     tree = _read(text, propositions, max_nodes)
     return tuple(
-        tuple((subtask.node, _shown(subtask)) for subtask in subtasks(tree, int(node), propositions))
+        tuple((subtask.node, shown(subtask)) for subtask in subtasks(tree, int(node), propositions))
         for node in np.flatnonzero(tree.valid)
     )
 
 
-def _shown(subtask: Subtask) -> str:
+def shown(subtask: Subtask) -> str:
     """A sub-task in SPECTRL."""
     text = "achieve " + _joined(subtask.reach)
     return f"{text} ensuring {_joined([f'not {name}' for name in subtask.avoid])}" if subtask.avoid else text
