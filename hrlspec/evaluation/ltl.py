@@ -22,7 +22,7 @@ from hrlspec.evaluation.results import interval_to_json
 from hrlspec.evaluation.stats import Interval, mean_interval, rate_interval
 from hrlspec.spec import SpecError, bare_lines
 from hrlspec.spec.automata import Automata, automata_of
-from hrlspec.spec.ltl import parse_ltl, to_automaton, to_buchi
+from hrlspec.spec.ltl import Automaton, parse_ltl, to_automaton, to_buchi
 from hrlspec.tasks.rewards import RewardMachine
 
 MAX_NODES = 64
@@ -170,9 +170,24 @@ def ltl_suite(name: str, text: str, env: Environment, *, forever: bool = False, 
         formulas.append(" ".join(line.split()))
     if not formulas:
         raise SpecError("found no formula, expected one on each line", source=name)
+    return suite_of_automata(name, formulas, automata, env, max_nodes=max_nodes)
+
+
+def suite_of_automata(
+    name: str, formulas: Sequence[str], automata: Sequence[Automaton], env: Environment, *, max_nodes: int = MAX_NODES
+) -> LtlSuite:
+    """A suite of tasks that are automata already.
+
+    Args:
+        name: of the suite.
+        formulas: what to call the M tasks.
+        automata: of the tasks, over the environment's `possible_labels`; all finite, or none.
+        env: the environment.
+        max_nodes: N, padded size of the trees that the states show.
+    """
     together, cut, silent = automata_of(automata, env.propositions, max_nodes)
     num_states = np.array([automaton.num_states for automaton in automata])
-    return LtlSuite(name, forever, tuple(formulas), together, num_states, cut, silent)
+    return LtlSuite(name, automata[0].marks is not None, tuple(formulas), together, num_states, cut, silent)
 
 
 def evaluate_ltl(

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 
 BAD_FLAGS: list[tuple[Sequence[str], str]] = [
     ((), "--run"),
-    (("--run", "run"), "expected exactly one of --spec, --spec-file, --ltl, --ltl-file and --suite, found none"),
+    (("--run", "run"), "expected exactly one of --spec, --spec-file, --ltl, --ltl-file, --hoa and --suite, found none"),
     (("--run", "run", "--spec", "achieve a", "--suite", "dag"), "found --spec and --suite"),
     (("--run", "nowhere", "--suite", "dag"), "nowhere is not a run folder"),
     (("--run", "file", "--suite", "dag"), "file"),
@@ -50,9 +50,12 @@ BAD_FLAGS: list[tuple[Sequence[str], str]] = [
     (("--run", "run", "--ltl", "a => b & c"), "line 1"),
     (("--run", "run", "--ltl", "F a"), "no checkpoint in run"),
     (("--run", "run", "--ltl", "FG a", "--forever"), "F G a asks to stay for ever"),
-    (("--run", "run", "--suite", "dag", "--forever"), "--forever goes with --ltl or --ltl-file"),
+    (("--run", "run", "--suite", "dag", "--forever"), "--forever goes with --ltl, --ltl-file or --hoa"),
     (("--run", "run", "--ltl-file", "nothing.txt"), "cannot read nothing.txt: No such file"),
     (("--run", "run", "--ltl-file", "binary"), "binary: not UTF-8"),
+    (("--run", "run", "--hoa", "nothing.hoa"), "cannot read nothing.hoa: No such file"),
+    (("--run", "run", "--hoa", "wrong"), "wrong, line 1, column 1: found '#'"),
+    (("--run", "run", "--hoa", "empty"), "empty, line 1, column 1: found '#'"),
     (("--run", "run", "--ltl-file", "empty"), "found no formula"),
     (("--run", "run", "--ltl-file", "wrong"), "wrong, line 2, column 9: "),
     (("--run", "run", "--suite", "jaxolotl/cats"), "unknown suite 'jaxolotl/cats'; published ones are: "),

@@ -21,6 +21,7 @@ from hrlspec.api import TrainedAgent, evaluate
 from hrlspec.config import Checked, setting
 from hrlspec.evaluation import LtlResult, LtlSuite, Suite, SuiteResult, evaluate_ltl, ltl_suite, suite_from_text
 from hrlspec.evaluation.ltl import MAX_NODES as LTL_NODES
+from hrlspec.evaluation.ltl import suite_of_automata
 from hrlspec.evaluation.suite import MAX_NODES
 from hrlspec.presets.peers import go_on_for_ever, peer_formulas
 from hrlspec.run import platform
@@ -32,10 +33,11 @@ from hrlspec.run.flags import parse_flags
 from hrlspec.run.folder import check_writable, read_record
 from hrlspec.run.tables import ltl_table, suite_table
 from hrlspec.run.unseen import with_tasks
-from hrlspec.spec import bare_lines
+from hrlspec.spec import SpecError, bare_lines
+from hrlspec.spec.hoa import from_hoa, until_accepting
 
 MOST_PICTURES = 9
-_TASKS = ("spec", "spec_file", "ltl", "ltl_file", "suite")
+_TASKS = ("spec", "spec_file", "ltl", "ltl_file", "hoa", "suite")
 _LARGEST_FILE = 1_000_000  # bytes
 
 
@@ -43,7 +45,7 @@ _LARGEST_FILE = 1_000_000  # bytes
 class EvaluateFlags(Checked):
     """Reports success, return, steps and SPL of a trained agent on the given tasks, in layouts drawn at random.
 
-    Exactly one of --spec, --spec-file, --ltl, --ltl-file and --suite says which tasks.
+    Exactly one of --spec, --spec-file, --ltl, --ltl-file, --hoa and --suite says which tasks.
     """
 
     run: Path
@@ -56,6 +58,8 @@ class EvaluateFlags(Checked):
     """A task in linear temporal logic, such as "F (a & (!b U c))", to be satisfied by the end of the episode."""
     ltl_file: Path | None = None
     """A file with one such formula a line."""
+    hoa: Path | None = None
+    """A file with an automaton in the Hanoi Omega-Automata format, deterministic Büchi."""
     forever: bool = False
     """Count how often a formula's accepting transitions are taken, instead of asking whether it is satisfied in the
     end. Published suites know it of themselves."""
@@ -177,12 +181,25 @@ def formulas_of(flags: EvaluateFlags, experiment: Experiment) -> LtlSuite | None
         name, text, forever = "--ltl", " ".join(bare_lines(flags.ltl)), flags.forever
     elif flags.ltl_file is not None:
         name, text, forever = flags.ltl_file.name, _read(flags.ltl_file), flags.forever
+    elif flags.hoa is not None:
+        return _of_automaton(flags.hoa, flags, experiment)
     elif flags.suite is not None and "/" in flags.suite:
         name, text, forever = flags.suite, peer_formulas(flags.suite), go_on_for_ever(flags.suite)
     else:
         return None
     env, max_nodes = experiment.preset.make(), min(flags.max_nodes, LTL_NODES)
     return ltl_suite(name, text, env, forever=forever, max_nodes=max_nodes)
+
+
+def _of_automaton(file: Path, flags: EvaluateFlags, experiment: Experiment) -> LtlSuite:
+    """A suite of the one task in a HOA file."""
+    env = experiment.preset.make()
+    try:
+        automaton = from_hoa(_read(file), env.propositions, env.possible_labels)
+    except SpecError as error:
+        raise SpecError(error.message, error.line, error.column, file.name) from None
+    automaton = automaton if flags.forever else until_accepting(automaton)
+    return suite_of_automata(file.name, [file.name], [automaton], env, max_nodes=min(flags.max_nodes, LTL_NODES))
 
 
 def tasks_of(flags: EvaluateFlags, experiment: Experiment) -> Suite:
@@ -220,9 +237,9 @@ def _check(flags: EvaluateFlags) -> None:
         found = " and ".join(f"--{name.replace('_', '-')}" for name in given) or "none"
         flags_there_are = ", ".join(f"--{name.replace('_', '-')}" for name in _TASKS[:-1])
         raise UserError(f"expected exactly one of {flags_there_are} and --suite, found {found}")
-    if flags.forever and flags.ltl is None and flags.ltl_file is None:
-        raise UserError("--forever goes with --ltl or --ltl-file")
-    if flags.draw is not None and not (flags.spec or flags.spec_file) and (flags.ltl or flags.ltl_file):
+    if flags.forever and flags.ltl is None and flags.ltl_file is None and flags.hoa is None:
+        raise UserError("--forever goes with --ltl, --ltl-file or --hoa")
+    if flags.draw is not None and not (flags.spec or flags.spec_file) and (flags.ltl or flags.ltl_file or flags.hoa):
         raise UserError("--draw takes tasks in SPECTRL, not in LTL")
     if flags.draw is not None and flags.draw.suffix not in (".png", ".svg"):
         raise UserError(f"--draw {flags.draw}: expected a file that ends in .png or .svg")

@@ -51,7 +51,7 @@ def to_automaton(
     """
     labels, distinct, columns = labels_of(formula, propositions, possible_labels)
     successors = _explore(Progression(distinct), formula)
-    successors, accepting, rejecting = _minimal(successors)
+    successors, accepting, rejecting = minimal(successors)
     return Automaton(labels, successors[:, columns], accepting, rejecting)
 
 
@@ -269,7 +269,7 @@ def _explore(progression: Progression, formula: Formula) -> np.ndarray:
     return np.array(rows)
 
 
-def _minimal(successors: np.ndarray) -> tuple[np.ndarray, int | None, int | None]:
+def minimal(successors: np.ndarray) -> tuple[np.ndarray, int | None, int | None]:
     """Merges states that no continuation tells apart, and numbers the rest in the order in which they are reached.
 
     Returns:
