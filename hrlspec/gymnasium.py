@@ -15,6 +15,7 @@ from typing import Any, Literal, get_args
 import envs_jax
 from envs_jax import Environment
 from envs_jax.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
+from hrlspec.spec.automata import MAX_PROPOSITIONS
 from hrlspec.tasks.ltl_tasks import LtlTasks
 from hrlspec.tasks.text_tasks import TextTasks
 
@@ -90,6 +91,9 @@ def _tasks(world: Environment, language: Language, max_nodes: int) -> TextTasks 
         raise ValueError(f"unknown language {language!r}, expected one of: {', '.join(get_args(Language))}")
     if language == "spectrl":
         return TextTasks(world.propositions, max_nodes)
+    if world.num_propositions > MAX_PROPOSITIONS:
+        found = f"{world.name} has {world.num_propositions} propositions"
+        raise ValueError(f"{found}, formulas in LTL take {MAX_PROPOSITIONS} at most")
     return LtlTasks(world.propositions, world.possible_labels, language == "ltl forever", max_nodes)
 
 

@@ -219,7 +219,6 @@ class PointMass(ContestedLayouts, ContestedChoice, Drawable):
         """50 ms; see :meth:`Environment.step_env`. The force acts along the heading before the turn."""
         del key
         most = np.array([MOST_FORCE, MOST_TURN], np.float32)
-        most = np.array([MOST_FORCE, MOST_TURN], np.float32)
         force, turn = most * jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0)
         acceleration = force * jnp.stack([jnp.cos(state.heading), jnp.sin(state.heading)])
         velocity = (state.velocity + acceleration * STEP) * (1.0 - DRAG)

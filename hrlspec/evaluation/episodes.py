@@ -9,7 +9,6 @@ import dataclasses
 import functools
 from typing import Any
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -91,13 +90,12 @@ def run_episodes(
 
     Returns:
         JAX arrays, leading axis B.
+
+    Raises:
+        ValueError: there are not as many tasks as layouts, or not as many as are named.
     """
-    total = jax.tree.leaves(layouts)[0].shape[0]
-    which = np.arange(total) if which is None else which
-    num_tasks = len(tasks.start) if isinstance(tasks, Automata) else tasks.parent.shape[0]
-    chex.assert_shape(which, (total,))
-    if which.max() >= num_tasks or which.min() < 0:
-        raise ValueError(f"which names task {which.max()}, there are {num_tasks}")
+    which = _which(tasks, layouts, which)
+    total = len(which)
     chunk = min(chunk, total)
     parts = []
     for first in range(0, total, chunk):
@@ -123,10 +121,28 @@ def trace_episodes(
     shield: bool = False,
 ) -> tuple[Episodes, Trace]:
     """As :func:`run_episodes`, for a few episodes, with their trajectories."""
-    which = np.arange(jax.tree.leaves(layouts)[0].shape[0]) if which is None else which
+    which = _which(tasks, layouts, which)
     episodes, trace = _run(key, agent, params, machine, *_begun(tasks, which), layouts, greedy, shield, True)
     assert trace is not None
     return episodes, trace
+
+
+def _which(tasks: TaskTree | Automata, layouts: Layout, which: Int[np.ndarray, " B"] | None) -> Int[np.ndarray, " B"]:
+    """The task of each episode.
+
+    Raises:
+        ValueError: there are not as many tasks as layouts, or not as many as are named.
+    """
+    num_layouts = jax.tree.leaves(layouts)[0].shape[0]
+    num_tasks = len(tasks.start) if isinstance(tasks, Automata) else tasks.parent.shape[0]
+    found = num_tasks if which is None else len(which)
+    if found != num_layouts:
+        raise ValueError(f"found {found} tasks for {num_layouts} layouts, expected one for each")
+    which = np.arange(num_tasks) if which is None else which
+    wrong = which[(which < 0) | (which >= num_tasks)]
+    if wrong.size:
+        raise ValueError(f"which names task {wrong[0]}, there are {num_tasks}")
+    return which
 
 
 def _begun(tasks: TaskTree | Automata, which: Int[np.ndarray, " B"]) -> tuple[TaskTree | Automata, Int32[Array, " B"]]:

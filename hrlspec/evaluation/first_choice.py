@@ -240,5 +240,5 @@ def _first_edges(
     book = agent.low.prepare(params, trees)
     worker = start(jax.random.split(reset_key, len(task)), agent.env, machine, book, layouts, task)
     shape = (len(task), trees.parent.shape[1])
-    noise = jnp.zeros(shape) if greedy else jax.random.gumbel(choice_key, shape, jnp.float32)
+    noise = jnp.zeros(shape, jnp.float32) if greedy else jax.random.gumbel(choice_key, shape, jnp.float32)
     return decide(agent, params, book, worker, worker.awaiting, noise).edge

@@ -21,7 +21,7 @@ from hrlspec.evaluation.episodes import Episodes, run_episodes
 from hrlspec.evaluation.results import interval_to_json
 from hrlspec.evaluation.stats import Interval, mean_interval, rate_interval
 from hrlspec.spec import SpecError, bare_lines
-from hrlspec.spec.automata import Automata, automata_of
+from hrlspec.spec.automata import MAX_PROPOSITIONS, Automata, automata_of
 from hrlspec.spec.ltl import Automaton, parse_ltl, to_automaton, to_buchi
 from hrlspec.tasks.rewards import RewardMachine
 
@@ -138,7 +138,7 @@ class LtlResult:
             "rounds_mean": self.rounds_mean if self.forever else None,
             "actions": "greedy" if self.greedy else "sampled",
             "episodes_per_formula": self.episodes,
-            "success_rate": self.success_rate,
+            "success_rate": None if self.forever else self.success_rate,
             "steps_mean": None if np.isnan(self.steps_mean) else self.steps_mean,
             "per_formula": [score.to_json() for score in self.per_formula],
         }
@@ -158,6 +158,9 @@ def ltl_suite(name: str, text: str, env: Environment, *, forever: bool = False, 
     Raises:
         SpecError: with the line and column of the first mistake, if an automaton is too large, or without a formula.
     """
+    if env.num_propositions > MAX_PROPOSITIONS:
+        found = f"{env.name} has {env.num_propositions} propositions"
+        raise SpecError(f"{found}, formulas in LTL take {MAX_PROPOSITIONS} at most", source=name)
     translate = to_buchi if forever else to_automaton
     formulas, automata = [], []
     for number, line in enumerate(bare_lines(text), 1):

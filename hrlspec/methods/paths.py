@@ -37,15 +37,22 @@ def open_paths(tree: TaskTree, state: TaskState, most: int, length: int) -> Path
     Args:
         tree: the task.
         state: where it stands.
-        most: L, how many are told apart; leaves beyond them are left out.
+        most: L, how many are told apart. Those beyond are left out in turn by first edge; in a small tree they are those
+            with the highest leaves.
         length: D, sub-tasks of a path; those beyond them are left out.
     """
     num_nodes = tree.num_nodes
     nodes = routes(tree, state.node, length)
     leads = tree.accepting & (nodes[:, 0] >= 0) & open_edges(tree, state)[nodes[:, 0]]
-    leaf = jnp.nonzero(leads, size=min(most, num_nodes), fill_value=num_nodes)[0].astype(jnp.int32)
-    at = jnp.minimum(leaf, num_nodes - 1)
-    return Paths(known=leaf < num_nodes, leaf=at, nodes=nodes[at])
+    if num_nodes <= 2 * most:  # about as many leaves as are told apart
+        leaf = jnp.nonzero(leads, size=min(most, num_nodes), fill_value=num_nodes)[0].astype(jnp.int32)
+        at = jnp.minimum(leaf, num_nodes - 1)
+        return Paths(known=leaf < num_nodes, leaf=at, nodes=nodes[at])
+    # In turn by their first edge, so that each has a path among those told apart.
+    number = jnp.arange(num_nodes, dtype=jnp.int32)
+    before = (leads & (nodes[:, :1] == nodes[:, 0]) & (number < number[:, None])).sum(1, dtype=jnp.int32)
+    leaf = jnp.argsort(jnp.where(leads, before * num_nodes + number, num_nodes**2 + number))[:most].astype(jnp.int32)
+    return Paths(known=leads[leaf], leaf=leaf, nodes=nodes[leaf])
 
 
 def sequence(tree: TaskTree, node: Int32[Array, ""], path: Int32[Array, " D"]) -> TaskTree:

@@ -42,8 +42,8 @@ class Preset:
         learning_rates: where a method's tuning chose another one than its recipe's, by recipe and method: the trial
             with the largest sum of the learning curve's mean and the final return (``reproduce --only walk-tuning`` and
             its like).
-        suites: test suites by name, and how those in the files of this package were drawn.
-        texts: the test suites by name, one formula a line, where they are not in those files.
+        suites: suites for test and validation by name, and how those in the files of this package were drawn.
+        texts: the suites by name, one formula a line, where they are not in those files.
         compiled_with: the effort that compiling programs is worth. Where matrix products, which are not compiled, are
             most of the time, the least.
     """
@@ -86,7 +86,7 @@ class Preset:
         return evolve(config, {"low.optimiser.learning_rate": rate}), chosen
 
     def effort(self, recipe_name: Recipe) -> Effort:
-        """How much a recipe's programs are compiled with; the others have more around its matrix products."""
+        """How much a recipe's programs are compiled with; the others have more around their matrix products."""
         return self.compiled_with if recipe_name == "hrlspec" else "most"
 
     def rewards(self, reward_set: RewardSet = 1) -> RewardMachine:
@@ -98,7 +98,7 @@ class Preset:
 
     @property
     def suite_names(self) -> tuple[str, ...]:
-        """The test suites; none for a world that nobody drew any for."""
+        """The suites; none for a world that nobody drew any for."""
         return (*self.suites, *self.texts)
 
     def suite_for(self, split: Split, name: str = "dag") -> Suite:
@@ -111,7 +111,7 @@ class Preset:
         return self.suite(other if split == "validation" and other in self.suite_names else name)
 
     def suite(self, name: str) -> Suite:
-        """A test suite by its name.
+        """A suite by its name.
 
         Raises:
             SuiteError: there is none, or its file cannot be read.

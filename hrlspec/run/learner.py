@@ -119,13 +119,17 @@ class Learner:
         choice = returns = first = None
         if self.agent.method.sees != "whole task":
             # There may be no such case, or nothing by which to tell what is best.
+            evaluation = None
             with contextlib.suppress(ValueError):
                 evaluation = first_choice_evaluation(self.env, suite, self.machine, **where)
+            if evaluation is not None:
                 first = evaluation(jax.random.fold_in(self._key(_FINAL_STREAM), 3), *how)
         if settings.contested and isinstance(self.env, Contestable):
             # An environment of somebody else's may be of that kind and yet have hardly any such layout.
+            contested = None
             with contextlib.suppress(ValueError):
                 contested = choice_evaluation(self.env, num_cases=settings.contested, **where)
+            if contested is not None:
                 choice = contested(keys[1], *how)
         if self.experiment.reward_set == 2 and "branches" in self.preset.suite_names:
             returns = return_evaluation(self.env, self._some("branches"), self.machine, **where)(keys[2], *how)

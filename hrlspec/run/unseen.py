@@ -21,7 +21,7 @@ def with_tasks(preset: Preset, folder: Path, seed: int) -> Preset:
     tasks = folder / "tasks"
     try:
         found = {file.stem: file.read_text(encoding="utf-8") for file in sorted(tasks.glob("*.txt"))}
-        texts = found or unseen_tasks(preset.make(), seed)
+        texts = found if "dag" in found else unseen_tasks(preset.make(), seed)
     except OSError as error:
         raise UserError(f"cannot read {tasks}: {error}") from error
     except ValueError as error:  # no text, or no task that can be satisfied

@@ -1,9 +1,8 @@
 """From an automaton to task trees: what the agent is shown in each state.
 
 In a state q that is a tree rooted at q: useful simple paths to acceptance (of a task that goes on for ever: to its next
-accepting transition), shortest first. A move is useful unless
-whatever is accepted after it would have been accepted without it. A sub-task's p₊ is the least that must hold for the
-automaton to move, its p₋ what takes the way on from it.
+accepting transition), shortest first. A move is useful unless whatever is accepted after it would have been accepted
+without it. A sub-task's p₊ is the least that must hold for the automaton to move, its p₋ what takes the way on from it.
 
 Axes: **Q** states, **L** labels, **N** tree nodes, **P** atomic propositions.
 """
@@ -11,7 +10,6 @@ Axes: **Q** states, **L** labels, **N** tree nodes, **P** atomic propositions.
 from __future__ import annotations
 
 import collections
-import functools
 import heapq
 import itertools
 from collections.abc import Iterator, Sequence
@@ -70,7 +68,18 @@ def unfold(automaton: Automaton, propositions: Sequence[str], max_nodes: int) ->
         rows.append(_tree(nodes, propositions, max_nodes))
         cut.append(not complete)
     trees: TaskTree = jax.tree.map(lambda *x: np.stack(x), *rows)
-    return Unfolded(trees, np.array(cut), np.array([moves.silent(state) for state in range(automaton.num_states)]))
+    silent = np.array([moves.silent(state) for state in range(automaton.num_states)])
+    return Unfolded(trees, np.array(cut), silent & ~_rests(automaton))
+
+
+def _rests(automaton: Automaton) -> Bool[np.ndarray, " Q"]:
+    """States in which rounds go by while nothing holds: nothing need be done there."""
+    empty: Label = frozenset()
+    if automaton.marks is None or empty not in automaton.labels:
+        return np.zeros(automaton.num_states, bool)
+    column = automaton.labels.index(empty)
+    stays = automaton.successors[:, column] == np.arange(automaton.num_states)
+    return np.asarray(automaton.marks[:, column] & stays)
 
 
 def _until_accepting(automaton: Automaton, marks: Bool[np.ndarray, "Q L"]) -> Automaton:
@@ -87,12 +96,17 @@ class _Moves:
     def __init__(self, automaton: Automaton) -> None:
         self.automaton = automaton
         self.after = {label: automaton.successors[:, column].tolist() for column, label in enumerate(automaton.labels)}
+        self._known: dict[int, tuple[Move, ...]] = {}
         self.distance = self._distances()
         self.within = self._inclusions()
 
-    @functools.cache  # noqa: B019  # an object lives as long as one unfolding
     def of(self, state: int) -> tuple[Move, ...]:
         """The useful moves of a state, those that ask for least first."""
+        if state not in self._known:
+            self._known[state] = self._found(state)
+        return self._known[state]
+
+    def _found(self, state: int) -> tuple[Move, ...]:
         targets: dict[int, list[Label]] = collections.defaultdict(list)
         for label, after in self.after.items():
             if label and self._is_useful(state, after[state]):
@@ -118,21 +132,23 @@ class _Moves:
         That is where it does not go where p₊ leads to, although p₊ holds; and where it goes to a state from which p₊
         leads to less.
         """
-        harmful: set[str] = set()
+        harmful = set()
         for label, after in self.after.items():
             onward = after[state] if label >= reach else self.after[reach][after[state]]
             if not self.within[target, onward]:
-                harmful |= label - reach
-        return frozenset(harmful)
+                harmful.add(label - reach)
+        # Clear of the least that does harm it is clear of all that holds besides.
+        return frozenset().union(*(some for some in harmful if not any(other < some for other in harmful)))
 
     def _inclusions(self) -> Bool[np.ndarray, "Q Q"]:
         """Entry (q, r): all that is accepted from q is accepted from r; the largest such relation."""
         successors, states = self.automaton.successors, np.arange(self.automaton.num_states)
         accepting = states == self.automaton.accepting
         within = ~accepting[:, None] | accepting
+        different = np.unique(successors.T, axis=0)  # many labels make no difference
         while True:
             narrower = within.copy()
-            for after in successors.T:
+            for after in different:
                 narrower &= within[np.ix_(after, after)]
             if np.array_equal(narrower, within):
                 return within

@@ -86,8 +86,6 @@ class LtlTasks:
             SpecError: if the text is no formula, names unknown propositions or needs more than S states.
         """
         automaton, table = _read(text, self)
-        if automaton.num_states > self.max_states:
-            raise SpecError(f"the automaton has {automaton.num_states} states, at most {self.max_states} are taken")
         missing = self.max_states - automaton.num_states
         padded: dict[str, Any] = {
             name: np.pad(getattr(table, name), [(0, missing)] + [(0, 0)] * (getattr(table, name).ndim - 1))
@@ -134,6 +132,8 @@ class LtlTasks:
 def _read(text: str, language: LtlTasks) -> tuple[Automaton, Automata]:
     translate = to_buchi if language.forever else to_automaton
     automaton = translate(parse_ltl(text), language.propositions, language.labels)
+    if automaton.num_states > language.max_states:
+        raise SpecError(f"the automaton has {automaton.num_states} states, at most {language.max_states} are taken")
     return automaton, automata_of([automaton], language.propositions, SHOWN_NODES)[0]
 
 

@@ -90,6 +90,8 @@ def test_tasks_of_any_size_in_one_program() -> None:
             np.testing.assert_array_equal(one[number::3], other[number::3])
     with pytest.raises(ValueError, match="which names task 3, there are 3"):
         run_episodes(KEY, WALKER, manner(), COMPLETION, together, some, which=np.full(9, 3), **how)
+    with pytest.raises(ValueError, match="found 3 tasks for 9 layouts, expected one for each"):
+        run_episodes(KEY, WALKER, manner(), COMPLETION, together, some, **how)
 
 
 def test_rounds_of_a_task_that_goes_on() -> None:

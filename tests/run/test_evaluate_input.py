@@ -43,6 +43,7 @@ BAD_FLAGS: list[tuple[Sequence[str], str]] = [
     (("--run", "run", "--spec", "\x00"), "line 1"),
     (("--run", "run", "--ltl", "F a", "--spec", "achieve a"), "found --spec and --ltl"),
     (("--run", "run", "--ltl", "F a", "--draw", "way.png"), "--draw takes tasks in SPECTRL"),
+    (("--run", "run", "--suite", "genz/letter_finite", "--draw", "way.png"), "no proposition"),
     (("--run", "run", "--ltl", ""), "found no formula"),
     (("--run", "run", "--ltl", "F (a"), "--ltl, line 1, column 5"),
     (("--run", "run", "--ltl", "F a b"), "--ltl, line 1, column 5: found 'b'"),

@@ -8,11 +8,21 @@ import io
 import pytest
 from rich.console import Console
 
-from hrlspec.evaluation import Aggregate, ChoiceResult, FirstChoiceResult, ReturnResult, Score, SuiteResult, TaskScore
+from hrlspec.evaluation import (
+    Aggregate,
+    ChoiceResult,
+    FirstChoiceResult,
+    FormulaScore,
+    LtlResult,
+    ReturnResult,
+    Score,
+    SuiteResult,
+    TaskScore,
+)
 from hrlspec.evaluation.stats import Interval
 from hrlspec.run.console import PlainConsole
 from hrlspec.run.learner import FinalResults
-from hrlspec.run.tables import aggregate_table, final_tables, suite_table
+from hrlspec.run.tables import aggregate_table, final_tables, ltl_table, suite_table
 
 NAN = float("nan")
 
@@ -108,3 +118,24 @@ def test_several_seeds(iqm: Interval | None) -> None:
     found = "\n".join(lines(aggregate_table("name", {"spl": Aggregate(3, Interval(0.96, 0.9, 1.02), iqm)})))
     assert "0.960 [.90,1.02]" in found
     assert ("0.970" in found) == (iqm is not None)
+
+
+def test_formulas_in_ltl() -> None:
+    """Marks say what the agent was not shown; of tasks for ever rounds count."""
+    rate, none = Interval(0.9, 0.8, 0.95), Interval(NAN, NAN, NAN)
+    scores = tuple(
+        FormulaScore(text, 5, cut, silent, rate, Interval(0.05, 0, 0.1), Interval(12.5, 12, 13), Interval(2.5, 2, 3))
+        for text, cut, silent in (("F a", False, False), ("F b", True, False), ("F c", False, True))
+    )
+    finite, forever = (
+        "\n".join(lines(ltl_table(LtlResult("some", forever, False, 512, scores)))) for forever in (False, True)
+    )
+    assert "F b*" in finite
+    assert "F c†" in finite
+    assert "0.900 [.80,.95]" in finite
+    assert "rounds" not in finite
+    assert "2.500 [2.00,3.00]" in forever
+    assert "success" not in forever
+    assert LtlResult("some", True, False, 512, scores).to_json()["success_rate"] is None
+    nothing = dataclasses.replace(scores[0], success_rate=Interval(0, 0, 0.1), steps_mean=none)
+    assert "-" in "\n".join(lines(ltl_table(LtlResult("none", False, True, 512, (nothing,)))))

@@ -9,9 +9,10 @@ import jax
 import numpy as np
 import pytest
 
+import envs_jax
 from hrlspec.spec import RUNNING, SATISFIED, VIOLATED, TaskTree, compile_task, parse, subtask_avoid
 from hrlspec.spec.automata import automata_of
-from hrlspec.spec.ltl import Automaton, parse_ltl, satisfies_ltl, to_automaton
+from hrlspec.spec.ltl import Automaton, parse_ltl, satisfies_ltl, to_automaton, to_buchi
 from hrlspec.spec.unfold import unfold
 from tests.spec.ltl.test_automaton import random_formula
 
@@ -68,6 +69,21 @@ def test_where_labels_overlap_what_does_not_count_is_avoided() -> None:
     assert tree.avoid[1].tolist() == [False, True, False, False]
     both = unfold(to_automaton(parse_ltl("F (a & b)"), NAMES, ALL), NAMES, 4).trees
     assert both.reach[0, 1].tolist() == [True, True, False, False]
+
+
+@pytest.mark.parametrize(("text", "reach", "avoid"), [("!blue U red", "red", "blue"), ("!blue U aqua", "aqua", "blue")])
+def test_of_overlapping_labels_only_what_does_harm_is_avoided(text: str, reach: str, avoid: str) -> None:
+    world = envs_jax.make("flatworld")
+    some = to_automaton(parse_ltl(text), world.propositions, world.possible_labels)
+    tree = jax.tree.map(lambda x: x[0], unfold(some, world.propositions, 4).trees)
+    assert [world.propositions[i] for i in np.flatnonzero(tree.reach[1])] == [reach]
+    assert [world.propositions[i] for i in np.flatnonzero(tree.avoid[1])] == [avoid]
+
+
+def test_where_rounds_go_by_nothing_need_be_done() -> None:
+    """F a for ever: once a was met every step is a round, whatever holds."""
+    for text in ("F a", "G !c"):
+        assert not unfold(to_buchi(parse_ltl(text), NAMES, ONE), NAMES, 4).silent.any()
 
 
 def test_what_begins_where_nothing_holds_is_said_to_be_left_out() -> None:

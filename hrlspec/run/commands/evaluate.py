@@ -99,6 +99,8 @@ def main(argv: Sequence[str], *, program: str = "hrlspec evaluate") -> None:
     _check(flags)
     experiment = experiment_of(read_record(flags.run)["config"], str(flags.run))
     formulas = formulas_of(flags, experiment)
+    if formulas is not None and flags.draw is not None:
+        raise UserError("--draw takes tasks in SPECTRL, no formulas and no automata")
     suite = None if formulas else tasks_of(flags, experiment)
     platform.prepare()
     agent = experiment.agent
@@ -107,9 +109,7 @@ def main(argv: Sequence[str], *, program: str = "hrlspec evaluate") -> None:
     key = jax.random.fold_in(jax.random.key(flags.seed), 1)
     if formulas is not None:
         how: dict[str, Any] = {"seed": flags.seed, "greedy": flags.greedy, "shield": flags.shield}
-        found = evaluate_ltl(
-            key, agent, params, experiment.rewards, formulas, episodes=flags.episodes, chunk=flags.episodes, **how
-        )
+        found = evaluate_ltl(key, agent, params, experiment.rewards, formulas, episodes=flags.episodes, **how)
         _show(flags, found, facts)
         return
     assert suite is not None
@@ -239,8 +239,6 @@ def _check(flags: EvaluateFlags) -> None:
         raise UserError(f"expected exactly one of {flags_there_are} and --suite, found {found}")
     if flags.forever and flags.ltl is None and flags.ltl_file is None and flags.hoa is None:
         raise UserError("--forever goes with --ltl, --ltl-file or --hoa")
-    if flags.draw is not None and not (flags.spec or flags.spec_file) and (flags.ltl or flags.ltl_file or flags.hoa):
-        raise UserError("--draw takes tasks in SPECTRL, not in LTL")
     if flags.draw is not None and flags.draw.suffix not in (".png", ".svg"):
         raise UserError(f"--draw {flags.draw}: expected a file that ends in .png or .svg")
     if flags.draw is not None:

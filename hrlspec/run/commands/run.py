@@ -130,7 +130,8 @@ def _run(
     preset = with_tasks(experiment.preset, folder, experiment.seed)
     learner = Learner(experiment, preset, devices)
     with open_run(folder, experiment, resume=resume, may_change=_may_change(flags)) as run:
-        for name, text in preset.texts.items():
+        # Suite dag comes last: where it is there all are.
+        for name, text in sorted(preset.texts.items(), reverse=True):
             run.write_tasks(name, text)
         job = learner.job()
         total = job.num_iterations * job.steps_per_iteration

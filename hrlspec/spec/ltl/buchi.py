@@ -276,12 +276,14 @@ def _merged(
         if finer.max() == kind.max():
             break
         kind = finer
-    order = [int(kind[0])]
-    example = {int(group): int(np.flatnonzero(kind == group)[0]) for group in np.unique(kind)}
-    for group in order:
-        order += [after for after in dict.fromkeys(kind[successors[example[group]]].tolist()) if after not in order]
-    number = {group: place for place, group in enumerate(order)}
-    rows = [example[group] for group in order]
+    example = dict(zip(*np.unique(kind, return_index=True), strict=True))
+    number, order = {int(kind[0]): 0}, [int(kind[0])]
+    for group in order:  # Grows while it is read.
+        for after in kind[successors[example[group]]].tolist():
+            if after not in number:
+                number[after] = len(order)
+                order.append(after)
+    rows = [int(example[group]) for group in order]
     dead = [place for place, row in enumerate(rows) if not alive[row]]
-    after = np.array([[number[group] for group in kind[successors[row]].tolist()] for row in rows], np.int32)
-    return after, marks[rows], dead[0] if dead else None
+    table = np.array([[number[group] for group in kind[successors[row]].tolist()] for row in rows], np.int32)
+    return table, marks[rows], dead[0] if dead else None

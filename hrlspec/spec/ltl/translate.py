@@ -106,7 +106,7 @@ class Progression:
         self._done_when_over = 0  # bits of the obligations that hold when no step is left
         self._steps: dict[tuple[int, int], Remainder] = {}
         self._clauses: dict[tuple[int, int], Remainder] = {}
-        self._normals: dict[tuple[int, bool], int] = {}
+        self._normals: dict[tuple[int, bool], tuple[Formula, int]] = {}
         self._work = 0
 
     def start(self, formula: Formula) -> Remainder:
@@ -131,8 +131,9 @@ class Progression:
         """The number of a formula, or of its negation, in negation normal form."""
         key = id(formula), positive
         if key not in self._normals:
-            self._normals[key] = self._normalised(formula, positive)
-        return self._normals[key]
+            # With the formula, so that no other one comes to have its identity.
+            self._normals[key] = formula, self._normalised(formula, positive)
+        return self._normals[key][1]
 
     def _normalised(self, formula: Formula, positive: bool) -> int:
         match formula:
