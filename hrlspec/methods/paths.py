@@ -37,8 +37,8 @@ def open_paths(tree: TaskTree, state: TaskState, most: int, length: int) -> Path
     Args:
         tree: the task.
         state: where it stands.
-        most: L, how many are told apart. Those beyond are left out in turn by first edge; in a small tree those with the
-            highest leaves are.
+        most: L, how many are told apart. Those beyond are left out in turn by first edge; in a small tree, by their
+            leaf.
         length: D, sub-tasks of a path; those beyond them are left out.
     """
     num_nodes = tree.num_nodes
