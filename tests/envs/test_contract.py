@@ -22,10 +22,10 @@ MAY_FAIL = {"flatworld", "zone", "zone-nm", "zone-jaxolotl", "zone-nm-jaxolotl"}
 """Environments whose episodes end where the square does."""
 
 
-# Between solid walls MJX takes a minute to compile for each test.
+# Between solid walls MJX takes a minute to compile for each test; of the point mass one world is enough.
+SLOW = {"zone-ltl2action", "zone-nm-jaxolotl"}
 PRESETS = [
-    pytest.param(name, marks=[pytest.mark.slow] if name == "zone-ltl2action" else [])
-    for name in (*envs_jax.registered(), "rooms")
+    pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in (*envs_jax.registered(), "rooms")
 ]
 
 

@@ -22,7 +22,6 @@ QUICK = {("letter", "hrlspec", method) for method in METHODS} | {
     ("letter", "planner", "ours"),
     ("walk", "hrlspec", "ours"),
     ("zone", "hrlspec", "ours"),
-    ("zone", "hrlspec", "option"),
 }
 CASES = [
     pytest.param(name, recipe, method, marks=() if (name, recipe, method) in QUICK else pytest.mark.slow)

@@ -122,6 +122,7 @@ def test_tasks_follow_the_seed() -> None:
     assert unseen_tasks(env, 1) != unseen_tasks(env, 2)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_done_in_time_is_left_out() -> None:
     """In Letter there is an exact solver. Four letters cannot be reached within three steps."""
     letter = Letter(size=4, num_letters=5, num_cells=5, horizon=3)

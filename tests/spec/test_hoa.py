@@ -132,7 +132,7 @@ def test_what_is_refused(old: str, new: str, message: str) -> None:
 def test_whatever_is_made_of_a_text_is_read_or_refused() -> None:
     rng = random.Random(0)
     words = [*ROUNDS.split(), "[", "]", "{", "}", "(", ")", "&", "|", "!", "999999999", "@x", '"', "--ABORT--"]
-    for _ in range(3000):
+    for _ in range(1000):
         text = ROUNDS
         for _ in range(rng.randrange(1, 4)):
             at = rng.randrange(len(text))
