@@ -102,17 +102,19 @@ def test_training_can_be_vmapped_and_scanned_by_other_code() -> None:
     assert metrics["returns"].shape == (2, 3)
 
 
-def test_progress_is_told_after_each_iteration() -> None:
-    for history, shape in ((alone(SEEDS[0])[1], ()), (together()[1], (len(SEEDS),))):
-        assert [steps for steps, _ in history] == [STEPS_PER_ITERATION * (i + 1) for i in range(ITERATIONS)]
-        assert history[-1][0] == CONFIG.total_steps
-        for _, metrics in history:
-            assert {"episodes", "successes", "returns", "level", "low/value_loss", "high/value_loss"} <= metrics.keys()
-            assert {np.shape(value) for value in metrics.values()} == {shape}
-            assert all(np.isfinite(value).all() for value in metrics.values())
-    assert sum(metrics["episodes"] for _, metrics in alone(SEEDS[0])[1]) > 100
+@pytest.mark.parametrize("several", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_progress_is_told_after_each_iteration(several: bool) -> None:
+    history, shape = (together()[1], (len(SEEDS),)) if several else (alone(SEEDS[0])[1], ())
+    assert [steps for steps, _ in history] == [STEPS_PER_ITERATION * (i + 1) for i in range(ITERATIONS)]
+    assert history[-1][0] == CONFIG.total_steps
+    for _, metrics in history:
+        assert {"episodes", "successes", "returns", "level", "low/value_loss", "high/value_loss"} <= metrics.keys()
+        assert {np.shape(value) for value in metrics.values()} == {shape}
+        assert all(np.isfinite(value).all() for value in metrics.values())
+    assert sum(metrics["episodes"].sum() for _, metrics in history) > 100
 
 
+@pytest.mark.slow
 def test_seeds_side_by_side_are_seeds_alone() -> None:
     """But for rounding, which is not the same in batches of another size.
 
@@ -137,6 +139,7 @@ def test_seeds_side_by_side_are_seeds_alone() -> None:
     assert np.linalg.norm(other) > 1
 
 
+@pytest.mark.slow
 def test_one_of_agents_trained_side_by_side() -> None:
     both, _ = together()
     for i in range(len(SEEDS)):
@@ -246,6 +249,7 @@ def test_a_trained_agent_is_evaluated_on_a_suite() -> None:
     assert result.to_json() == expected.to_json()
 
 
+@pytest.mark.slow
 def test_one_of_many_is_evaluated() -> None:
     both, _ = together()
     result = hrlspec.evaluate(jax.random.key(1), both[1], "achieve a\nachieve b", episodes=20)
