@@ -34,8 +34,10 @@ takes the nearest instance. The ratio is of the steps that ours takes to 90 % of
 method. Figures are interquartile means over seeds (training: means) with stratified bootstrap intervals (95 %); bands
 are Student's t intervals. All methods run through the same loop, with the same curriculum and, but for No-ER,
 relabelling. Recipe `paper` collects with the shield, also for Option; LTL2Action has no sub-task and so nothing to
-shield. Recipe `hrlspec` has no shield. Training times are of runs side by side, one on each core, with compilation and
-evaluations; a few include a pause or other programs beside them."""
+shield. Recipe `hrlspec` has no shield. The records that are kept are of the first drawing of the suites, on whose tasks
+settings were chosen as well; tasks for validation and test have since been drawn anew, apart from each other. Training
+times are of runs side by side, one on each core, with compilation and evaluations; a few include a pause or other
+programs beside them."""
 _ABOUT_CLAIMS = """\
 The share is the probability that a run of the one beats a run of the other: in the mean of its curve where the claim is
 about learning, in its final return where it is about the end. A claim holds, or does not, where the interval excludes a
