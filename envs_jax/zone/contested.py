@@ -7,14 +7,26 @@ Such layouts are drawn to be trained on. Whoever tests takes layouts of all kind
 
 from __future__ import annotations
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Bool, Float, Int, Key
+from jaxtyping import Bool, Float, Float32, Int, Key
 
 from envs_jax.arrays import Array
-from envs_jax.zone.layouts import COLOURS, MOST_DRAWS, NUM_ZONES, SPAWN, ZONE_KEEPOUT, ZONES_EACH, ZoneLayout
+from envs_jax.base import ContestedChoice, ContestedLayouts, EnvParams
+from envs_jax.zone.layouts import (
+    COLOURS,
+    MOST_DRAWS,
+    NUM_ZONES,
+    SPAWN,
+    ZONE_KEEPOUT,
+    ZONES_EACH,
+    ZoneLayout,
+    no_layout,
+)
 
 ROBOT_WITHIN = 0.3
 """The robot starts this close to the middle along each axis (m)."""
@@ -50,6 +62,58 @@ class _Core:
     better: Float[Array, "*lead 2"]  # of the first colour
     nearer: Float[Array, "*lead 2"]  # of the first colour
     goal: Float[Array, "*lead 2"]  # of the second colour
+
+
+class Contests(ContestedLayouts, ContestedChoice):
+    """What worlds of such zones have in common: layouts that are made to be contested, and ways in all others.
+
+    Attributes:
+        vanishing: pairs of colours (first, second) of which the first makes the second vanish.
+    """
+
+    vanishing: tuple[tuple[str, str], ...]
+
+    def contested_layout(
+        self,
+        key: Key[Array, ""],
+        first: Bool[Array, " P"],
+        second: Bool[Array, " P"],
+        params: EnvParams,
+    ) -> ZoneLayout:
+        """A layout on which going to the nearest zone first makes the whole way longer. The key is consumed.
+
+        Args:
+            key: of the draw.
+            first: bool ``[P]``, the colour to reach first.
+            second: bool ``[P]``, the colour to reach after it.
+            params: of the environment.
+
+        Returns:
+            A `envs_jax.zone.contested.contested_layout`, whose right zone of the first colour is number 0; where a
+            colour is missing, several are given or both are the same, what :meth:`sample_layout` draws.
+        """
+        wanted = (first.sum() == 1) & (second.sum() == 1) & ~(first & second).any()
+        plain = self.resample_layout(key, no_layout(), ~wanted, params)
+        contested = contested_layout(key, jnp.argmax(first), jnp.argmax(second), needed=wanted)
+        return jax.tree.map(lambda this, other: jnp.where(wanted, this, other), contested, plain)
+
+    @property
+    def contested_pairs(self) -> tuple[tuple[int, int], ...]:
+        """Colours to go to first and then that a contested layout can be about: the first leaves the second there."""
+        colours = self.propositions
+        names = itertools.permutations(colours, 2)
+        return tuple((colours.index(a), colours.index(b)) for a, b in names if (a, b) not in self.vanishing)
+
+    @property
+    def least_detour(self) -> float:
+        """Half a metre."""
+        return LEAST_DETOUR
+
+    def ways(
+        self, layout: ZoneLayout, first: Bool[Array, " P"], second: Bool[Array, " P"]
+    ) -> tuple[Float32[Array, " I"], Float32[Array, " I"]]:
+        """See the function of that name."""
+        return ways(layout, jnp.argmax(first), jnp.argmax(second))
 
 
 def contested_layout(

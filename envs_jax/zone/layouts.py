@@ -76,6 +76,11 @@ def new_layout(key: Key[Array, ""], layout: ZoneLayout, needed: Bool[Array, ""])
     return jax.tree.map(lambda new, old: jnp.where(needed, new, old.astype(jnp.float32)), fresh, layout)
 
 
+def no_layout() -> ZoneLayout:
+    """Like no layout that is ever drawn."""
+    return ZoneLayout(robot=jnp.zeros(3, jnp.float32), zones=jnp.zeros((len(COLOURS), ZONES_EACH, 2), jnp.float32))
+
+
 def _place_next(draw: _Draw, previous: Float[Array, "objects 2"]) -> _Draw:
     """One block of draws for the next object."""
     index = np.arange(1 + NUM_ZONES)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 from typing import NamedTuple
 
 import jax
@@ -19,10 +18,10 @@ from flax import struct
 from jaxtyping import Bool, Float, Float32, Int32, Key, Shaped
 
 from envs_jax.arrays import Array
-from envs_jax.base import Box, ContestedChoice, ContestedLayouts, Drawable, EnvParams, StepResult, at_most_one
+from envs_jax.base import Box, Drawable, EnvParams, StepResult, at_most_one
 from envs_jax.scenes import DiscScene, Region
-from envs_jax.zone.contested import LEAST_DETOUR, contested_layout, ways
-from envs_jax.zone.layouts import NUM_ZONES, ZONES_EACH, ZoneLayout
+from envs_jax.zone.contested import Contests
+from envs_jax.zone.layouts import NUM_ZONES, ZONES_EACH, ZoneLayout, no_layout
 from envs_jax.zone.world import LIDAR_BINS, lidar_readings
 
 COLOURS = ("red", "green", "purple", "yellow")
@@ -85,7 +84,7 @@ class PointMassState:
 
 
 @dataclasses.dataclass(frozen=True)
-class PointMass(ContestedLayouts, ContestedChoice, Drawable):
+class PointMass(Contests, Drawable):
     """Zone with a point mass.
 
     Layout: a `ZoneLayout`. Observation: float32 ``[69]``: acceleration and velocity along x and y, turn rate, and a
@@ -141,9 +140,7 @@ class PointMass(ContestedLayouts, ContestedChoice, Drawable):
 
     def sample_layout(self, key: Key[Array, ""], params: EnvParams) -> ZoneLayout:
         """A random layout."""
-        zones = jnp.zeros((len(COLOURS), ZONES_EACH, 2), jnp.float32)
-        nothing = ZoneLayout(robot=jnp.zeros(3, jnp.float32), zones=zones)
-        return self.resample_layout(key, nothing, jnp.bool_(True), params)
+        return self.resample_layout(key, no_layout(), jnp.bool_(True), params)
 
     def resample_layout(
         self, key: Key[Array, ""], layout: ZoneLayout, needed: Bool[Array, ""], params: EnvParams
@@ -152,33 +149,6 @@ class PointMass(ContestedLayouts, ContestedChoice, Drawable):
         del params
         fresh = _new_layout(key, layout.robot[:2], needed)
         return jax.tree.map(lambda new, old: jnp.where(needed, new, old.astype(jnp.float32)), fresh, layout)
-
-    def contested_layout(
-        self, key: Key[Array, ""], first: Bool[Array, " P"], second: Bool[Array, " P"], params: EnvParams
-    ) -> ZoneLayout:
-        """As that of `envs_jax.zone.world.Zone`, where the same colours have other names."""
-        wanted = (first.sum() == 1) & (second.sum() == 1) & ~(first & second).any()
-        nothing = ZoneLayout(robot=jnp.zeros(3, jnp.float32), zones=jnp.zeros((len(COLOURS), ZONES_EACH, 2)))
-        plain = self.resample_layout(key, nothing, ~wanted, params)
-        contested = contested_layout(key, jnp.argmax(first), jnp.argmax(second), needed=wanted)
-        return jax.tree.map(lambda this, other: jnp.where(wanted, this, other), contested, plain)
-
-    @property
-    def contested_pairs(self) -> tuple[tuple[int, int], ...]:
-        """Colours to go to first and then: the first leaves the second there."""
-        names = itertools.permutations(COLOURS, 2)
-        return tuple((COLOURS.index(a), COLOURS.index(b)) for a, b in names if (a, b) not in self.vanishing)
-
-    @property
-    def least_detour(self) -> float:
-        """Half a metre."""
-        return LEAST_DETOUR
-
-    def ways(
-        self, layout: ZoneLayout, first: Bool[Array, " P"], second: Bool[Array, " P"]
-    ) -> tuple[Float32[Array, " I"], Float32[Array, " I"]]:
-        """See `envs_jax.zone.contested.ways`."""
-        return ways(layout, jnp.argmax(first), jnp.argmax(second))
 
     def instance_at(self, state: PointMassState, goal: Bool[Array, " P"]) -> Int32[Array, ""]:
         """Which zone of a colour (``goal``, one-hot bool ``[P]``) the robot is nearest to, int32 ``[]``."""

@@ -19,8 +19,6 @@ from jaxtyping import Bool, Float, Float32, Int32, Key, Shaped
 from envs_jax.arrays import Array
 from envs_jax.base import (
     Box,
-    ContestedChoice,
-    ContestedLayouts,
     Drawable,
     EnvParams,
     Reflections,
@@ -30,8 +28,8 @@ from envs_jax.base import (
 )
 from envs_jax.scenes import DiscScene, Region
 from envs_jax.zone import physics as zone_physics
-from envs_jax.zone.contested import LEAST_DETOUR, contested_layout, ways
-from envs_jax.zone.layouts import COLOURS, ZONES_EACH, ZoneLayout, new_layout
+from envs_jax.zone.contested import Contests
+from envs_jax.zone.layouts import COLOURS, ZoneLayout, new_layout, no_layout
 from envs_jax.zone.physics import NUM_SENSORS, Backend, import_mjx
 
 LIDAR_BINS = 16
@@ -63,7 +61,7 @@ class ZoneState:
 
 
 @dataclasses.dataclass(frozen=True)
-class Zone(Symmetric, ContestedLayouts, ContestedChoice, Drawable):
+class Zone(Symmetric, Contests, Drawable):
     """The Zone world.
 
     Layout: a `ZoneLayout`, the robot's pose and two zones of each colour. Observation: float32 ``[80]``:
@@ -136,7 +134,7 @@ class Zone(Symmetric, ContestedLayouts, ContestedChoice, Drawable):
 
     def sample_layout(self, key: Key[Array, ""], params: EnvParams) -> ZoneLayout:
         """A random layout: robot and zones apart, see `envs_jax.zone.layouts.new_layout`."""
-        return self.resample_layout(key, _no_layout(), jnp.bool_(True), params)
+        return self.resample_layout(key, no_layout(), jnp.bool_(True), params)
 
     def resample_layout(
         self, key: Key[Array, ""], layout: ZoneLayout, needed: Bool[Array, ""], params: EnvParams
@@ -144,30 +142,6 @@ class Zone(Symmetric, ContestedLayouts, ContestedChoice, Drawable):
         """A random layout other than ``layout`` where ``needed``, else ``layout``."""
         del params
         return new_layout(key, layout, needed)
-
-    def contested_layout(
-        self,
-        key: Key[Array, ""],
-        first: Bool[Array, " P"],
-        second: Bool[Array, " P"],
-        params: EnvParams,
-    ) -> ZoneLayout:
-        """A layout on which going to the nearest zone first makes the whole way longer. The key is consumed.
-
-        Args:
-            key: of the draw.
-            first: bool ``[P]``, the colour to reach first.
-            second: bool ``[P]``, the colour to reach after it.
-            params: of the environment.
-
-        Returns:
-            A `envs_jax.zone.contested.contested_layout`, whose right zone of the first colour is number 0; where a
-            colour is missing, several are given or both are the same, what :meth:`sample_layout` draws.
-        """
-        wanted = (first.sum() == 1) & (second.sum() == 1) & ~(first & second).any()
-        plain = self.resample_layout(key, _no_layout(), ~wanted, params)
-        contested = contested_layout(key, jnp.argmax(first), jnp.argmax(second), needed=wanted)
-        return jax.tree.map(lambda this, other: jnp.where(wanted, this, other), contested, plain)
 
     @functools.cached_property
     def symmetries(self) -> Reflections:
@@ -199,23 +173,6 @@ class Zone(Symmetric, ContestedLayouts, ContestedChoice, Drawable):
             # Whichever way it drives is forward; where that changed with the bearing alone, it could dither for ever.
             heading=tuple(4.0 * (i == 3) for i in range(NUM_SENSORS + rest)),
         )
-
-    @property
-    def contested_pairs(self) -> tuple[tuple[int, int], ...]:
-        """Colours to go to first and then that a contested layout can be about: the first leaves the second there."""
-        names = itertools.permutations(COLOURS, 2)
-        return tuple((COLOURS.index(a), COLOURS.index(b)) for a, b in names if (a, b) not in self.vanishing)
-
-    @property
-    def least_detour(self) -> float:
-        """Half a metre."""
-        return LEAST_DETOUR
-
-    def ways(
-        self, layout: ZoneLayout, first: Bool[Array, " P"], second: Bool[Array, " P"]
-    ) -> tuple[Float32[Array, " I"], Float32[Array, " I"]]:
-        """See `envs_jax.zone.contested.ways`."""
-        return ways(layout, jnp.argmax(first), jnp.argmax(second))
 
     def instance_at(self, state: ZoneState, goal: Bool[Array, " P"]) -> Int32[Array, ""]:
         """Which zone of a colour (``goal``, one-hot bool ``[P]``) the robot is nearest to, int32 ``[]``."""
@@ -351,11 +308,6 @@ def lidar_readings(
 
 def _tuples(rows: Any) -> tuple[tuple[Any, ...], ...]:
     return tuple(tuple(row) for row in np.array(rows).tolist())
-
-
-def _no_layout() -> ZoneLayout:
-    """Like no layout that is ever drawn."""
-    return ZoneLayout(robot=jnp.zeros(3, jnp.float32), zones=jnp.zeros((len(COLOURS), ZONES_EACH, 2), jnp.float32))
 
 
 PRESETS = {
