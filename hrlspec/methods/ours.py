@@ -195,6 +195,7 @@ class ImplicitPlanner(Checked, HighLevel):
     def _with_transe(
         self, low: LowLevel, params: Any, batch: HighBatch, loss: Float32[Array, ""], metrics: Metrics
     ) -> tuple[Float32[Array, ""], Metrics]:
+        """A loss and its parts, the TransE loss added where it has a weight."""
         if not self.transe:
             return loss, metrics
         error = self.transe_loss(self.planner(low), params, batch)

@@ -15,6 +15,7 @@ import envs_jax
 from envs_jax.zone.contested import contested_layout, ways
 from envs_jax.zone.layouts import ZoneLayout
 from envs_jax.zone.world import BOUNDARY, PRESETS, Zone
+from hrlspec.exact.contested import contested_suite
 
 # These need no MuJoCo: the two kinds of physics are compared in test_zone_physics.
 ENV = PRESETS["zone"](physics="closed-form")
@@ -231,6 +232,25 @@ def test_ways_in_contested_layouts_and_in_all_others() -> None:
     np.testing.assert_allclose(whole, [1 + 4, 2 + 1])
     zones[BLUE] = [[1, 0], [2, 0.1]]
     assert ways(ZoneLayout(robot=np.zeros(3), zones=jnp.asarray(zones)), BLUE, GREEN)[1][1] == np.inf
+
+
+def test_a_contested_suite_is_of_layouts_whose_straight_ways_are_so() -> None:
+    """Half a metre longer over the nearest zone, or shorter; no other zone of the colour on the way there."""
+    suite = contested_suite(jax.random.key(5), ENV, num_cases=40)
+    assert suite.contested.tolist() == [True] * 20 + [False] * 20
+    for case in range(40):
+        robot, zones = suite.layouts.robot[case, :2], suite.layouts.zones[case]
+        first, second = (int(suite.tasks.reach[case, node].argmax()) for node in (1, 2))
+        near = np.linalg.norm(zones[first] - robot, axis=-1)
+        whole = near + np.linalg.norm(zones[first][:, None] - zones[second], axis=-1).min(-1)
+        nearest = int(near.argmin())
+        longer = whole[nearest] - whole[1 - nearest]
+        assert (longer >= 0.4999) if suite.contested[case] else (longer <= -0.4999)
+        assert suite.nearest[case] == nearest
+        assert suite.right[case].tolist() == [zone == (nearest ^ int(suite.contested[case])) for zone in (0, 1)]
+        along = zones[first][1 - nearest] - robot
+        share = np.clip((zones[first][nearest] - robot) @ along / (along @ along), 0, 1)
+        assert np.linalg.norm(zones[first][nearest] - robot - share * along) >= 0.5499
 
 
 def test_contested_where_two_colours_are_given() -> None:
