@@ -16,15 +16,16 @@ from experiments.paper.making import command, make
 from experiments.paper.panels import (
     NUM_SEEDS,
     PANELS,
-    RECIPES,
     TRAJECTORIES,
     TRAJECTORY_TASKS,
+    TRIAL_SEEDS,
     TUNING,
     Panel,
     Run,
     trajectory_run,
 )
 from experiments.paper.records import read_records, record_of
+from hrlspec.presets import RECIPES
 from hrlspec.run.cli import call
 from hrlspec.run.console import PlainConsole
 from hrlspec.run.errors import UserError
@@ -43,7 +44,7 @@ class ReproduceFlags:
     recipes: tuple[str, ...] = RECIPES
     """Whose curves."""
     seeds: int = NUM_SEEDS
-    """Runs of each curve, seeds 0, 1, ... One for tuning."""
+    """Runs of each curve, seeds 0, 1, ... For tuning at most three."""
     steps: int | None = None
     """Environment steps of each run; 1.5 M in Letter, 2 M in Walk and 4 M in Zone if not given."""
     jobs: int | None = None
@@ -149,12 +150,13 @@ def _check(flags: ReproduceFlags) -> None:
             raise UserError(f"--{name} is {value}, expected at least 1")
     for recipe in flags.recipes:
         if recipe not in RECIPES:
-            raise UserError(f"--recipes {recipe}: there is no such recipe, expected paper, hrlspec or both")
+            raise UserError(f"--recipes {recipe}: there is no such recipe, expected some of: {', '.join(RECIPES)}")
 
 
 def _runs(panels: Sequence[Panel], flags: ReproduceFlags) -> list[Run]:
     """All runs of the panels, each once; a panel's seeds one after the other."""
-    every = [run for panel in panels for run in panel.runs(1 if panel.name in TUNING else flags.seeds, flags.steps)]
+    seeds = {name: min(flags.seeds, TRIAL_SEEDS) for name in TUNING}
+    every = [run for panel in panels for run in panel.runs(seeds.get(panel.name, flags.seeds), flags.steps)]
     return list(dict.fromkeys(run for run in every if run.curve.recipe in flags.recipes))
 
 

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 
-from hrlspec.presets import Recipe, RewardSet, Split
+from hrlspec.presets import RECIPES, Recipe, RewardSet, Split
 
-RECIPES: tuple[Recipe, ...] = ("paper", "hrlspec")
 ENVIRONMENTS = ("letter", "walk", "zone")
 BUDGETS = {"letter": 1_500_000, "walk": 2_000_000, "zone": 4_000_000}
 """Environment steps of a run."""
-NUM_SEEDS = 5
-FIRST_DEVELOPMENT_SEED = 100
-"""Seeds from here on are for tuning."""
+NUM_SEEDS = 10
+FIRST_DEVELOPMENT_SEED = 1000
+"""Seeds from here on are for development."""
+FIRST_TRIAL_SEED = 1100
+"""Those from here on choose settings."""
 POINTS = 20
 """Evaluations along a curve."""
+BASELINES = ("ltl2action", "option")
+_ABLATED = ("ours", "myopic-low", "no-er")
 _OPTIMISER = "config.low.optimiser."
 
 
@@ -107,17 +110,18 @@ class Panel:
         return [Run(self.env, self.reward_set, curve, seed, steps) for seed in seeds for curve in self.curves]
 
 
-_COMPARED: tuple[str, ...] = ("ours", "ltl2action", "option")
-_ABLATED: tuple[str, ...] = ("ours", "myopic-low", "no-er")
+def in_recipe(method: str, recipe: Recipe, switches: tuple[str, ...] = ()) -> Curve:
+    """A method's curve under a recipe. Recipe ``planner`` is ``paper`` to all that do without the planner."""
+    return Curve(method, "paper" if recipe == "planner" and method in BASELINES else recipe, switches)
 
 
-def _curves(methods: tuple[str, ...]) -> tuple[Curve, ...]:
-    return tuple(Curve(method, recipe) for recipe in RECIPES for method in methods)
+def _curves(methods: tuple[str, ...], recipes: tuple[Recipe, ...]) -> tuple[Curve, ...]:
+    return tuple(dict.fromkeys(in_recipe(method, recipe) for recipe in recipes for method in methods))
 
 
 def _comparison(env: str, reward_set: RewardSet) -> Panel:
     title = f"{env.capitalize()}, reward set {reward_set}"
-    return Panel(f"{env}-set{reward_set}", title, env, reward_set, _curves(_COMPARED))
+    return Panel(f"{env}-set{reward_set}", title, env, reward_set, _curves(("ours", *BASELINES), RECIPES))
 
 
 PANELS = {
@@ -126,7 +130,7 @@ PANELS = {
         *(_comparison(env, 1) for env in ENVIRONMENTS),
         *(_comparison(env, 2) for env in ENVIRONMENTS),
         *(
-            Panel(f"{env}-ablation", f"{env.capitalize()}, ablations", env, 2, _curves(_ABLATED))
+            Panel(f"{env}-ablation", f"{env.capitalize()}, ablations", env, 2, _curves(_ABLATED, ("paper", "hrlspec")))
             for env in ENVIRONMENTS
         ),
         # Beyond the paper's figures, for two of its claims.
@@ -145,33 +149,40 @@ PANELS = {
 }
 
 
-TRIED = {
-    ("letter", "paper"): (5e-4, 1e-3, 2e-3),
-    ("letter", "hrlspec"): (3.5e-4, 7e-4, 1.4e-3),
-    ("walk", "paper"): (5e-4, 1e-3, 2e-3),
-    ("walk", "hrlspec"): (5e-4, 1e-3, 2e-3),
-    ("zone", "paper"): (3.5e-4, 7e-4, 1.4e-3),
-    ("zone", "hrlspec"): (3.5e-4, 7e-4, 1.4e-3),
+def _around(*rates: float) -> dict[str, tuple[float, ...]]:
+    """For ours, LTL2Action and Option, each: half of a rate, the rate, and twice of it."""
+    return {method: (rate / 2, rate, 2 * rate) for method, rate in zip(("ours", *BASELINES), rates, strict=True)}
+
+
+TRIED: dict[tuple[str, Recipe], dict[str, tuple[float, ...]]] = {
+    ("letter", "paper"): _around(2e-3, 2e-3, 2e-3),
+    ("letter", "hrlspec"): _around(7e-4, 3.5e-4, 1.4e-3),
+    ("walk", "paper"): _around(1e-3, 2e-3, 2e-3),
+    ("walk", "hrlspec"): _around(1e-3, 1e-3, 2e-3),
+    ("zone", "paper"): _around(1.4e-3, 7e-4, 1.4e-3),
+    ("zone", "hrlspec"): _around(1.4e-3, 1.4e-3, 1.4e-3),
 }
-"""Learning rates of the low level, the same for every method: half, once and twice what the recipe began with."""
+"""Learning rates of the low level that were tried for each method, until the best was none of the outer ones."""
+TRIAL_SEEDS = 3
 
 
 def _trials(env: str) -> tuple[Curve, ...]:
     return tuple(
         Curve(method, recipe, (f"--{_OPTIMISER}learning-rate={rate:g}",))
-        for recipe in RECIPES
-        for method in _COMPARED
-        for rate in TRIED[env, recipe]
+        for (of, recipe), tried in TRIED.items()
+        if of == env
+        for method, rates in tried.items()
+        for rate in rates
     )
 
 
 TUNING = {
     f"{env}-tuning": Panel(
-        f"{env}-tuning", f"{env.capitalize()}, tuning", env, 2, _trials(env), first_seed=FIRST_DEVELOPMENT_SEED
+        f"{env}-tuning", f"{env.capitalize()}, tuning", env, 2, _trials(env), first_seed=FIRST_TRIAL_SEED
     )
     for env in ENVIRONMENTS
 }
-"""What the learning rates in ``presets.py`` were chosen by: one run each, with a seed that no panel uses."""
+"""What the learning rates in ``presets.py`` were chosen by, with seeds and tasks that no panel uses."""
 
 TRAJECTORIES = "walk-trajectories"
 """The figure of trained agents' ways in Walk, which needs a run's checkpoint and not only its record."""

@@ -12,37 +12,52 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.paper.claims import (
-    CLAIMS,
+    LEVEL,
     Records,
+    family,
     final_return,
-    finding,
+    findings,
     mean_return,
     over_seeds,
     steps_to_most,
 )
-from experiments.paper.panels import PANELS, RECIPES, TRAJECTORIES, TUNING, Curve, Panel, Run
+from experiments.paper.panels import (
+    FIRST_TRIAL_SEED,
+    PANELS,
+    TRAJECTORIES,
+    TRIAL_SEEDS,
+    TUNING,
+    Curve,
+    Panel,
+    Run,
+    in_recipe,
+)
 from experiments.paper.records import Record
 from hrlspec.evaluation.stats import interquartile_mean, mean_interval
+from hrlspec.presets import RECIPES
 from hrlspec.run.progress import duration
 
 _ABOUT = """\
 Written by `python -m experiments.reproduce` from the records in `results/paper`; each names the flags that made it.
 Returns are undiscounted means over 2,000 episodes of 200 unseen tasks (at the end) or 100 episodes of 10 (along the
 curves), actions sampled, no shield. Steps are those of successful episodes; "of optimum" is the share of the best way's
-return, where an exact planner knows it (suite `branches`); contested is contested choice, 0.5 for an agent that always
-takes the nearest instance. The ratio is of the steps that ours takes to 90 % of its curve's last value to those of the
-method. Figures are interquartile means over seeds (training: means) with stratified bootstrap intervals (95 %); bands
-are Student's t intervals. All methods run through the same loop, with the same curriculum and, but for No-ER,
-relabelling. Recipe `paper` collects with the shield, also for Option; LTL2Action has no sub-task and so nothing to
-shield. Recipe `hrlspec` has no shield. The records that are kept are of the first drawing of the suites, on whose tasks
-settings were chosen as well; tasks for validation and test have since been drawn anew, apart from each other. Training
-times are of runs side by side, one on each core, with compilation and evaluations; a few include a pause or other
-programs beside them."""
+return, where an exact planner knows it (suite `branches`); first choice is the share of first sub-tasks that are best
+ones, in tasks where that matters; contested is contested choice, 0.5 for an agent that always takes the nearest
+instance. The ratio is of the steps that ours takes to 90 % of its curve's last value to those of the method. Figures
+are interquartile means over seeds (training: means) with stratified bootstrap intervals (95 %); bands are Student's t
+intervals. All methods run through the same loop, with the same curriculum and, but for No-ER, relabelling. Recipe
+`paper` collects with the shield, also for Option; LTL2Action has no sub-task and so nothing to shield. Recipe `hrlspec`
+has no shield. The records that are kept are of the first drawing of the suites, on whose tasks settings were chosen as
+well; tasks for validation and test have since been drawn anew, apart from each other. Training times are of runs side
+by side, one on each core, with compilation and evaluations; a few include a pause or other programs beside them."""
 _ABOUT_CLAIMS = """\
-The share is the probability that a run of the one beats a run of the other: in the mean of its curve where the claim is
-about learning, in its final return where it is about the end. A claim holds, or does not, where the interval excludes a
-half. For those that do not, experiments that look for the reason are in `docs/decisions.md`, "Where claims do not
-hold"."""
+Means over seeds are compared: of the curve's mean where the claim is about learning, of the final return where it is
+about the end. The difference has Welch's 95 % interval; the share is the probability that a run of the one beats a run
+of the other, with a bootstrap interval. p is that of the two-sided exact permutation test, corrected by Holm's method
+for all claims in all panels under all recipes, {family} tests, also those whose runs are not there yet. A claim holds,
+or does not, where the corrected p is below {level}. Recipe `planner` is compared with the baselines under recipe
+`paper`, of which it is a variant. For claims that do not hold, experiments that look for the reason are in
+`docs/decisions.md`, "Where claims do not hold"."""
 _FEWEST_FOR_BAND = 3
 """Student's t interval of two seeds is twelve times as wide as what they differ by."""
 
@@ -80,11 +95,15 @@ def _of_panel(panel: Panel, records: Mapping[Run, Record]) -> dict[Curve, list[R
 def _draw(panel: Panel, records: Records, file: Path) -> Path:
     """One axis for each recipe that has curves."""
     recipes = [recipe for recipe in RECIPES if any(curve.recipe == recipe for curve in records)]
+    drawn = {
+        recipe: [curve for curve in panel.curves if curve == in_recipe(curve.method, recipe, curve.switches)]
+        for recipe in recipes
+    }
     figure = Figure(figsize=(0.5 + 4.5 * len(recipes), 3.6), layout="constrained")
     axes: Any = figure.subplots(1, len(recipes), squeeze=False, sharey=True)
     for ax, recipe in zip(axes[0], recipes, strict=True):
         # A method has one colour, whatever else is there yet.
-        for colour, curve in enumerate(curve for curve in panel.curves if curve.recipe == recipe):
+        for colour, curve in enumerate(drawn[recipe]):
             if curve in records:
                 _band(ax, f"C{colour}", curve.label.rpartition(" (")[0], records[curve])
         ax.set_title(f"{panel.title}, recipe {recipe}", fontsize=10)
@@ -116,24 +135,21 @@ def _page(by_panel: Mapping[Panel, Records], figures: Path, report: Path) -> Ite
     yield ""
     yield "## The paper's claims"
     yield ""
-    yield _ABOUT_CLAIMS
+    yield _ABOUT_CLAIMS.format(family=len(family()), level=LEVEL)
     yield ""
-    yield "| claim | panel | recipe | share | seeds | verdict |"
-    yield "|---|---|---|---|---|---|"
-    for claim in CLAIMS:
-        for name in claim.panels:
-            for recipe in RECIPES:
-                found = finding(claim, recipe, by_panel.get(PANELS[name], {}))
-                if found is not None:
-                    seeds = " and ".join(map(str, found.seeds))
-                    yield f"| {claim.text} | {name} | {recipe} | {found.improvement} | {seeds} | {found.verdict} |"
+    yield "| claim | panel | recipe | difference | share | p | corrected | seeds | verdict |"
+    yield "|---|---|---|---|---|---|---|---|---|"
+    for test, found in findings({panel.name: records for panel, records in by_panel.items()}).items():
+        what = f"{test.claim.text} | {test.panel} | {test.recipe} | {found.difference} | {found.improvement}"
+        seeds = " and ".join(map(str, found.seeds))
+        yield f"| {what} | {found.p_value:.2g} | {found.corrected:.2g} | {seeds} | {found.verdict} |"
     for panel, records in by_panel.items():
         yield ""
         yield f"## {panel.title}"
         yield ""
         yield f"![{panel.title}]({(figures / panel.name).as_posix()}.png)"
         yield ""
-        scores = ("success", "steps", "SPL", "contested", "of optimum")
+        scores = ("success", "steps", "SPL", "first choice", "contested", "of optimum")
         columns = ("curve", "seeds", "final return", *scores, "mean of the curve", "steps to 90 %", "ratio")
         yield f"| {' | '.join(columns)} | training |"
         yield "|---" * (len(columns) + 1) + "|"
@@ -176,14 +192,16 @@ def _tuning(trials: Mapping[Panel, Records]) -> Iterator[str]:
     yield ""
     yield "## Tuning"
     yield ""
-    yield "Every method had the same trials: one run for each learning rate of the low level, seed 100, reward set 2."
-    yield "The one with the largest sum of both columns is the preset."
+    yield f"Every method had the same trials: {TRIAL_SEEDS} runs for each learning rate of the low level, seeds from"
+    yield f"{FIRST_TRIAL_SEED} on, reward set 2, tasks for validation. The one with the largest sum of both columns,"
+    yield "means over seeds, is the preset."
     yield ""
-    yield "| environment | trial | mean of the curve | final return |"
-    yield "|---|---|---|---|"
+    yield "| environment | trial | seeds | mean of the curve | final return |"
+    yield "|---|---|---|---|---|"
     for panel, records in trials.items():
-        for curve, (record,) in records.items():
-            yield f"| {panel.env} | {curve.label} | {mean_return(record):.3f} | {final_return(record):.3f} |"
+        for curve, some in records.items():
+            learning, final = (np.mean([score(record) for record in some]) for score in (mean_return, final_return))
+            yield f"| {panel.env} | {curve.label} | {len(some)} | {learning:.3f} | {final:.3f} |"
 
 
 def _rows(records: Records) -> Iterator[str]:
@@ -195,9 +213,11 @@ def _rows(records: Records) -> Iterator[str]:
         ratio = f"{fastest[curve.recipe] / steps:.2f}" if curve.recipe in fastest else ""
         suites = [record.final["suite"] for record in some]
         contested = [record.final.get("contested_choice") or {} for record in some]
+        first = [record.final.get("first_choice") or {} for record in some]
         optimum = [record.final.get("return_over_optimum") or {} for record in some]
         scores = [_mean(suites, "success_rate"), _mean(suites, "steps_mean", ".0f"), _mean(suites, "spl")]
-        scores += [_mean(contested, "contested_choice"), _mean(optimum, "return_over_optimum")]
+        scores += [_mean(first, "first_choice"), _mean(contested, "contested_choice")]
+        scores += [_mean(optimum, "return_over_optimum")]
         wall = duration(float(np.mean([record.wall_s for record in some])))
         final = " | ".join([str(over_seeds(final_return, some)), *scores])
         learning = f"{over_seeds(mean_return, some)} | {steps:,.0f} | {ratio} | {wall}"

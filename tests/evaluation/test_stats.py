@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+
 import numpy as np
 import pytest
 import scipy.stats
@@ -9,8 +12,11 @@ import scipy.stats
 from hrlspec.evaluation.stats import (
     Interval,
     bounded_interval,
+    difference_interval,
+    holm,
     interquartile_mean,
     mean_interval,
+    permutation_test,
     probability_of_improvement,
     rate_interval,
     stratified_bootstrap,
@@ -180,3 +186,47 @@ def test_bad_input_is_refused() -> None:
 
 def test_how_an_interval_reads() -> None:
     assert str(Interval(0.95, 0.9, 0.98)) == "0.950 [0.900, 0.980]"
+
+
+def test_a_difference_has_welchs_interval() -> None:
+    rng = np.random.default_rng(3)
+    ours, theirs = rng.normal(1.0, 2.0, 10), rng.normal(size=7)
+    variances = np.array([ours.var(ddof=1) / 10, theirs.var(ddof=1) / 7])
+    freedom = variances.sum() ** 2 / (variances**2 / [9, 6]).sum()  # Welch and Satterthwaite
+    half = scipy.stats.t.ppf(0.975, freedom) * np.sqrt(variances.sum())
+    mean = ours.mean() - theirs.mean()
+    np.testing.assert_allclose(difference_interval(ours, theirs), (mean, mean - half, mean + half))
+    np.testing.assert_equal(tuple(difference_interval([3.0], [1.0, 2.0])), (1.5, np.nan, np.nan))
+    assert difference_interval([3.0, 3.0], [1.0, 1.0]) == (2, 2, 2)
+
+
+def test_the_permutation_test_counts_all_divisions() -> None:
+    rng = np.random.default_rng(0)
+    for sizes in ((4, 3), (5, 5)):
+        ours, theirs = (
+            rng.integers(0, 6, size).astype(float) + shift for size, shift in zip(sizes, (1, 0), strict=True)
+        )
+        together, size = np.concatenate([ours, theirs]), sum(sizes)
+        first = np.array(list(itertools.combinations(range(size), sizes[0])))
+        sums = together[first].sum(1)
+        differences = sums / sizes[0] - (together.sum() - sums) / sizes[1]
+        observed = ours.mean() - theirs.mean()
+        ends = [np.mean(differences >= observed - 1e-9), np.mean(differences <= observed + 1e-9)]
+        assert permutation_test(ours, theirs) == pytest.approx(min(1.0, 2 * min(ends)))
+    assert permutation_test(range(10), range(10, 20)) == pytest.approx(2 / math.comb(20, 10))
+    assert permutation_test([1.0] * 5, [1.0] * 5) == 1
+
+
+def test_the_permutation_test_is_wrong_no_more_often_than_it_says() -> None:
+    rng = np.random.default_rng(1)
+    trials = 400
+    false = np.mean([permutation_test(rng.exponential(size=5), rng.exponential(size=5)) <= 0.1 for _ in range(trials)])
+    assert false < 0.1 + 4 * np.sqrt(0.1 * 0.9 / trials)
+
+
+def test_holms_correction() -> None:
+    """Holm (1979): the least of m is multiplied by m, the next by m - 1, and none becomes less than one before."""
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.01, 0.04], family=5) == pytest.approx([0.05, 0.16])
+    assert holm([0.9, 0.8]) == [1, 1]
+    assert holm([]) == []

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from experiments.paper.panels import PANELS, TUNING, Curve, Run
+from experiments.paper.panels import NUM_SEEDS, PANELS, TUNING, Curve, Run
 from experiments.paper.records import CURVE, add_record, read_records, record_file, record_of
 from hrlspec.run.errors import UserError
 from hrlspec.run.folder import open_run
@@ -114,7 +114,9 @@ def test_what_is_kept_of_a_run_folder(tmp_path: Path) -> None:
 
 
 def test_all_kept_records_are_of_runs_of_the_panels() -> None:
-    kept = read_records([run for panel in (PANELS | TUNING).values() for run in panel.runs(5, None)], RESULTS / "paper")
+    kept = read_records(
+        [run for panel in (PANELS | TUNING).values() for run in panel.runs(NUM_SEEDS, None)], RESULTS / "paper"
+    )
     lines = [(file.name, line) for file in (RESULTS / "paper").glob("*.jsonl") for line in lines_of(file)]
     assert len(kept) == sum("run" in line for _, line in lines) > 0
     hashes = [

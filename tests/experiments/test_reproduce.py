@@ -18,17 +18,19 @@ from experiments import reproduce
 from experiments.paper import making
 from experiments.paper.claims import (
     CLAIMS,
-    Claim,
+    family,
     final_return,
-    finding,
+    findings,
     mean_return,
     no_violations,
     steps_to_most,
 )
 from experiments.paper.panels import (
     BUDGETS,
+    NUM_SEEDS,
     PANELS,
     TRAJECTORY_TASKS,
+    TRIAL_SEEDS,
     TRIED,
     TUNING,
     Curve,
@@ -36,11 +38,11 @@ from experiments.paper.panels import (
     Run,
     trajectory_run,
 )
-from experiments.paper.records import CURVE, Record, add_record, read_records, record_of
+from experiments.paper.records import CURVE, add_record, read_records, record_of
 from experiments.paper.report import write_report
 from hrlspec import compile_task, parse
 from hrlspec.methods import ImplicitPlanner
-from hrlspec.presets import Recipe, preset
+from hrlspec.presets import RECIPES, Recipe, preset
 from hrlspec.run.errors import Interrupted, UserError
 from hrlspec.run.experiment import Experiment
 from hrlspec.run.run_flags import experiments_of, parse_run
@@ -76,7 +78,7 @@ def test_there_are_nine_panels_of_the_paper_and_one_of_techniques() -> None:
 
 def test_every_run_is_one_that_can_be_made_and_has_a_name_of_its_own() -> None:
     runs = {run for panel in (PANELS | TUNING).values() for run in panel.runs(1, None)}
-    assert len({run.name for run in runs}) == len(runs) == 50 + 54
+    assert len({run.name for run in runs}) == len(runs) == 56 + 54
     for run in runs:
         experiment = experiment_now(run)
         assert (experiment.env, experiment.method, experiment.recipe) == (run.env, run.curve.method, run.curve.recipe)
@@ -90,35 +92,37 @@ def test_every_run_is_one_that_can_be_made_and_has_a_name_of_its_own() -> None:
 
 def test_every_method_is_tuned_alike() -> None:
     for env, panel in zip(BUDGETS, TUNING.values(), strict=True):
-        runs = panel.runs(1, None)
-        tried: dict[tuple[str, str], list[float]] = {}
+        runs = panel.runs(TRIAL_SEEDS, None)
+        tried: dict[tuple[Recipe, str], set[float]] = {}
         for run in runs:
-            experiment = experiment_now(run)
-            kind = (run.curve.recipe, run.curve.method)
-            tried.setdefault(kind, []).append(experiment.config.low.optimiser.learning_rate)
+            assert run.split == "validation"
+            rate = experiment_now(run).config.low.optimiser.learning_rate
+            tried.setdefault((run.curve.recipe, run.curve.method), set()).add(rate)
         assert len(tried) == 6
-        assert all(rates == list(TRIED[(env, recipe)]) for (recipe, _), rates in tried.items())
+        assert all(rates == {*TRIED[env, recipe][method]} for (recipe, method), rates in tried.items())
         panels = [other for name, other in PANELS.items() if name.startswith(env)]
-        assert not {run.seed for run in runs} & {run.seed for other in panels for run in other.runs(5, None)}
+        assert not {run.seed for run in runs} & {run.seed for other in panels for run in other.runs(NUM_SEEDS, None)}
 
 
 @pytest.mark.parametrize("panel", TUNING.values(), ids=lambda panel: panel.env)
 def test_presets_have_the_rates_that_tuning_chose(panel: Panel) -> None:
-    """The trials whose records are kept, as far as all of a method's are there."""
-    trials: dict[tuple[Recipe, str], dict[float, float]] = {}
-    for run, kept in read_records(panel.runs(1, None), KEPT).items():
+    """Where all of a method's trials are kept; and none of the outer rates."""
+    trials: dict[tuple[Recipe, str], dict[float, list[float]]] = {}
+    for run, kept in read_records(panel.runs(TRIAL_SEEDS, None), KEPT).items():
         rate = experiment_now(run).config.low.optimiser.learning_rate
         score = mean_return(kept) + final_return(kept)
-        trials.setdefault((run.curve.recipe, run.curve.method), {})[rate] = score
-    for (recipe, method), means in trials.items():
-        if len(means) == len(TRIED[panel.env, recipe]):
-            best = max(means, key=lambda rate: means[rate])
+        trials.setdefault((run.curve.recipe, run.curve.method), {}).setdefault(rate, []).append(score)
+    for (recipe, method), scores in trials.items():
+        rates = TRIED[panel.env, recipe][method]
+        if sum(map(len, scores.values())) == TRIAL_SEEDS * len(rates):
+            best = max(scores, key=lambda rate: np.mean(scores[rate]))
+            assert min(rates) < best < max(rates)
             assert preset(panel.env).settings(method, recipe, 2)[0].low.optimiser.learning_rate == best
 
 
 def test_kept_records_are_of_what_their_flags_mean_today() -> None:
     """Whoever changes a preset makes the runs with it anew and deletes the records for that, or says what changed."""
-    kept = read_records([run for panel in (PANELS | TUNING).values() for run in panel.runs(5, None)], KEPT)
+    kept = read_records([run for panel in (PANELS | TUNING).values() for run in panel.runs(NUM_SEEDS, None)], KEPT)
     assert kept
     for run, found in kept.items():
         now = dataclasses.asdict(experiment_now(run))
@@ -143,24 +147,35 @@ def test_scores_of_a_record() -> None:
     assert steps_to_most(record([0.0, 0.0], 0.0)) == 100
 
 
+def test_the_family_is_every_claim_wherever_its_curves_are() -> None:
+    tests = family()
+    assert {test.claim for test in tests} == {*CLAIMS}
+    assert {test.recipe for test in tests} == {*RECIPES}
+    for test in tests:
+        assert len({*test.sides}) == 2
+        assert {*test.sides} <= {*PANELS[test.panel].curves}
+    assert len(tests) == 6 * 4 * 3 + 3 * 4 * 2 + 2
+    against = {test.sides for test in tests if test.recipe == "planner"}
+    ours = Curve("ours", "planner")
+    others = [Curve(method, "paper") for method in ("ltl2action", "option")]
+    assert against == {*((ours, other) for other in others), (others[1], ours)}
+
+
 def test_findings() -> None:
-    claim = Claim("", ("walk-set1",), ("ours", ()), ("option", ()), final_return)
     rng = np.random.default_rng(0)
 
-    def records(ours: float, option: float, seeds: int = 5) -> dict[Curve, list[Record]]:
+    def verdicts(ours: float, option: float, seeds: int = 10) -> dict[str, str]:
         means = {Curve("ours", "paper"): ours, Curve("option", "paper"): option}
-        return {c: [record([0.0], final=m + 0.01 * rng.normal()) for _ in range(seeds)] for c, m in means.items()}
+        some = {c: [record([0.5], final=m + 0.01 * rng.normal()) for _ in range(seeds)] for c, m in means.items()}
+        return {test.claim.text: found.verdict for test, found in findings({"walk-set2": some}).items()}
 
-    def verdict(some: dict[Curve, list[Record]]) -> str | None:
-        found = finding(claim, "paper", some)
-        return None if found is None else found.verdict
-
-    assert verdict(records(0.9, 0.5)) == "holds"
-    assert verdict(records(0.5, 0.9)) == "does not hold"
-    assert verdict(records(0.7, 0.7)) == "undecided"
-    assert verdict(records(0.9, 0.5, seeds=4)) == "too few seeds"
-    assert verdict(records(0.9, 0.5, seeds=1)) is None
-    assert finding(claim, "hrlspec", records(0.9, 0.5)) is None
+    better, faster = "Ours ends with a better return than Option", "Ours learns faster than Option"
+    assert verdicts(0.9, 0.5) == {better: "holds", faster: "undecided"}
+    assert verdicts(0.5, 0.9)[better] == "does not hold"
+    assert verdicts(0.7, 0.7)[better] == "undecided"
+    # Of as many tests as there are five seeds cannot decide any.
+    assert verdicts(0.9, 0.5, seeds=5)[better] == "undecided"
+    assert verdicts(0.9, 0.5, seeds=1) == {}
 
 
 def test_the_report_is_drawn_from_records_alone_and_always_the_same(tmp_path: Path) -> None:
@@ -179,11 +194,11 @@ def test_the_report_is_drawn_from_records_alone_and_always_the_same(tmp_path: Pa
     assert contents[0] == contents[1]
     page = contents[0][1].decode()
     assert "](../figures/letter-techniques.png)" in page
-    assert "| ours without max operator (paper) | 3 | 0.600 [0.500, 0.700] | 0.600 | 50 | 0.600 | 0.600 |" in page
-    assert "| ours without shield (paper) | 3 | 0.600 [0.500, 0.700] | 0.600 | 50 |  |  |" in page
-    assert "| letter-set2 | 3 runs, 3:00 |  |" in page  # ours is there, too
-    assert "| letter-techniques | 6 runs, 6:00 |  |" in page
-    assert "| The max operator helps | letter-techniques | paper | 0.500" in page
+    assert "| ours without max operator (paper) | 3 | 0.600 [0.500, 0.700] | 0.600 | 50 | 0.600 |  | 0.600 |" in page
+    assert "| ours without shield (paper) | 3 | 0.600 [0.500, 0.700] | 0.600 | 50 |  |  |  |" in page
+    assert "| letter-set2 | 3 runs, 3:00 |  |  |" in page  # ours is there, too
+    assert "| letter-techniques | 6 runs, 6:00 |  |  |" in page
+    assert "| The max operator helps | letter-techniques | paper | 0.000 [" in page
     assert "walk-set1" not in page
 
 
@@ -191,7 +206,7 @@ def test_the_report_tells_the_trials(tmp_path: Path) -> None:
     panel = TUNING["zone-tuning"]
     records = {run: record([0.5], 0.25) for run in panel.runs(1, None)[:2]}
     (page,) = write_report([], records, tmp_path, tmp_path / "page.md")
-    assert "| zone | ours learning rate 0.0007 (paper) | 0.500 | 0.250 |" in page.read_text()
+    assert "| zone | ours learning rate 0.0007 (paper) | 1 | 0.500 | 0.250 |" in page.read_text()
 
 
 @pytest.mark.parametrize(
@@ -260,7 +275,7 @@ def test_a_dry_run_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFi
     add_record(done, record([0.5], 0.5), tmp_path)
     reproduce.main(["--only", "walk-set1", "--seeds", "2", "--dry-run", "--out", str(tmp_path)])
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 11
+    assert len(lines) == 13
     assert not any("--method ours --recipe paper --reward-set 1 --seed 0" in line for line in lines)
 
 
