@@ -45,6 +45,22 @@ def where(condition: Bool[Array, " E"], new: Inputs, old: Inputs) -> Inputs:
     return picked
 
 
+def if_any(function: Callable[[], Outputs], needed: Bool[Array, " E"], outputs: Outputs) -> Outputs:
+    """What ``function`` makes of all environments where it is needed, and ``outputs`` in the others.
+
+    A CPU does not compute it unless some environment needs it; an accelerator would have to wait to be told.
+
+    Args:
+        function: gives a pytree of leading axis E.
+        needed: bool ``[E]``.
+        outputs: pytree, leading axis E: what the others keep.
+    """
+    if jax.default_backend() != "cpu":
+        return where(needed, function(), outputs)
+    kept: Outputs = jax.lax.cond(needed.any(), lambda: where(needed, function(), outputs), lambda: outputs)
+    return kept
+
+
 def in_groups(
     function: Callable[[Inputs], Outputs], needed: Bool[Array, " E"], inputs: Inputs, outputs: Outputs, group: int
 ) -> Outputs:

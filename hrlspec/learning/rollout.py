@@ -20,7 +20,7 @@ from envs_jax.arrays import Array
 from envs_jax.base import Layout
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.experience import Bootstrap, HighDecision, LowDecision, Step, View, flat
-from hrlspec.agent.groups import in_groups, one_by_one, take, where
+from hrlspec.agent.groups import if_any, in_groups, one_by_one, take, where
 from hrlspec.agent.high_level import Judgement
 from hrlspec.agent.interaction import Worker, act, decide, start, task_of, transition
 from hrlspec.agent.low_level import Params, TaskBook
@@ -217,8 +217,7 @@ def _step(setting: Setting, carry: tuple[Collector, _Reach], chance: _Chance) ->
     ended = outcome.terminated | outcome.truncated
     started = collector.started + ended
     fresh = take(pool, jnp.arange(num_envs, dtype=jnp.int32), started % pool.task.shape[1])
-    begun = start(reset_keys, agent.env, setting.machine, book, fresh.layout, fresh.task)
-    after = where(ended, begun, worker)
+    after = if_any(lambda: start(reset_keys, agent.env, setting.machine, book, fresh.layout, fresh.task), ended, worker)
     reached = _reach_values(setting, worker.view)
     decision, bootstrap = _plan(setting, after, worker, outcome.truncated, chance.high)
     record = Step(

@@ -42,7 +42,10 @@ def zone(settings: Settings, recipe: Recipe) -> Settings:
             "config.curriculum.max_avoid": 2,
         }
     )
-    return _of_paper(settings) if recipe != "hrlspec" else once(settings, minibatches=20)
+    if recipe != "hrlspec":
+        return _of_paper(settings)
+    # An episode takes longer than a rollout, and drawing contested layouts was an eighth of an iteration.
+    return once(settings, minibatches=20).evolve({"config.steps_per_slot": 64})
 
 
 def _of_paper(settings: Settings) -> Settings:

@@ -13,7 +13,7 @@ from hrlspec.agent import groups
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.distributions import Categorical
 from hrlspec.agent.experience import View
-from hrlspec.agent.groups import in_groups
+from hrlspec.agent.groups import if_any, in_groups
 from hrlspec.agent.low_level import LowLevel
 from hrlspec.agent.shield import shielded_action
 from hrlspec.methods import MyopicLow
@@ -47,6 +47,24 @@ def test_groups_compute_for_those_in_need_and_keep_the_rest(
     np.testing.assert_allclose(sums, np.where(needed, inputs["x"].sum(-1), -1), rtol=1e-5, atol=1e-6)
     expected = np.stack([inputs["i"], 2 * inputs["i"]], -1)
     np.testing.assert_array_equal(pairs_, np.where(needed[:, None], expected, -1))
+
+
+@pytest.mark.parametrize("backend", ["cpu", "an accelerator"])
+@pytest.mark.parametrize("needed", [(False, False, False), (False, True, False), (True, True, True)])
+def test_what_none_needs_is_not_computed_on_a_cpu(
+    backend: str, needed: tuple[bool, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    calls: list[int] = []
+
+    def function() -> jax.Array:
+        jax.debug.callback(lambda: calls.append(1))
+        return jnp.arange(3.0)
+
+    found = if_any(function, jnp.asarray(needed), -jnp.ones(3))
+    jax.effects_barrier()
+    np.testing.assert_array_equal(found, np.where(needed, np.arange(3.0), -1))
+    assert len(calls) == (backend != "cpu" or any(needed))
 
 
 def read_shield(threshold: float, q: np.ndarray, avoid: set[int], action: int) -> int:
