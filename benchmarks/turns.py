@@ -2,8 +2,9 @@
 
 python -m benchmarks.turns before=../before:1 before=../before:2 now=.:2 [--env letter] [--recipe hrlspec] [--out FILE]
 
-Each contestant is ``NAME=CHECKOUT:DEVICES``; ratios are to the first. Machines that are shared change their speed by a
-third within minutes, so what ran one after the other cannot be compared; what takes turns every few seconds can.
+Each contestant is ``NAME=CHECKOUT:DEVICES``, with ``@CORES`` behind it on so many cores alone; ratios are to the first.
+Machines that are shared change their speed by a third within minutes, so what ran one after the other cannot be
+compared; what takes turns every few seconds can.
 """
 
 from __future__ import annotations
@@ -25,8 +26,10 @@ from hrlspec.run.errors import UserError, main_guard
 
 # Run with each checkout's own modules; so it may use only what all of them have.
 _CONTESTANT = """
-import json, sys, time
+import json, os, sys, time
 name, recipe, devices, changes = sys.argv[1], sys.argv[2], int(sys.argv[3]), json.loads(sys.argv[4])
+if sys.argv[5]:
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: int(sys.argv[5])])
 from hrlspec.run.platform import prepare
 prepare(host_devices=devices)
 import jax, jax.numpy as jnp
@@ -54,8 +57,8 @@ class Flags:
     """What to compare."""
 
     contestants: tyro.conf.Positional[tuple[str, ...]]
-    """NAME=CHECKOUT:DEVICES, the first is what the others are compared to; with ',{"config.blocks": 4}' at its end
-    (JSON) some settings of this one are others."""
+    """NAME=CHECKOUT:DEVICES[@CORES], the first is what the others are compared to; with ',{"config.blocks": 4}' at its
+    end (JSON) some settings of this one are others."""
     env: str = "letter"
     recipe: Recipe = "hrlspec"
     warmup: int = 60
@@ -73,13 +76,15 @@ class Contestant:
     def __init__(self, text: str, env: str, recipe: str) -> None:
         text, _, changes = text.partition(",")
         self.name, _, where = text.partition("=")
-        checkout, _, devices = where.rpartition(":")
-        root = Path(checkout).resolve()
-        if not devices.isdigit() or not (root / "benchmarks" / "common.py").is_file():
-            raise UserError(f"contestant {text!r}: expected NAME=CHECKOUT:DEVICES, with a checkout of this project")
-        self.what = {"commit": _commit(root), "devices": int(devices), **({"changes": changes} if changes else {})}
+        checkout, _, where = where.rpartition(":")
+        root, (devices, at, cores) = Path(checkout).resolve(), where.partition("@")
+        numbers = devices.isdigit() and cores.isdigit() == bool(at)
+        if not numbers or not (root / "benchmarks" / "common.py").is_file():
+            raise UserError(f"contestant {text!r}: expected NAME=CHECKOUT:DEVICES[@CORES], a checkout of this project")
+        self.what = {"commit": _commit(root), "devices": int(devices)}
+        self.what |= ({"cores": int(cores)} if cores else {}) | ({"changes": changes} if changes else {})
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _CONTESTANT, env, recipe, devices, changes or "{}"],
+            [sys.executable, "-c", _CONTESTANT, env, recipe, devices, changes or "{}", cores],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=root,
             env=os.environ | {"PYTHONPATH": str(root)},
         )  # fmt: skip
