@@ -95,37 +95,3 @@ def test_links_lead_somewhere(page: str) -> None:
 
 def test_decisions_fit_on_three_pages() -> None:
     assert len(PAGES["decisions.md"].splitlines()) <= 150
-
-
-CLAIMS = {
-    "ours learns faster than LTL2Action": "Ours learns faster than LTL2Action",
-    "ours ends above LTL2Action": "Ours ends with a better return than LTL2Action",
-    "ours ends above Option": "Ours ends with a better return than Option",
-    "Option learns faster in Walk, set 1": "Option learns faster on Walk under reward set 1",
-    "Myopic-low learns less than ours": "Without future sub-tasks the low level learns less",
-    "Myopic-low ends below ours": "Without future sub-tasks it ends with a lower return",
-    "No-ER learns less than Myopic-low": "Without relabelling it learns less still",
-}
-"""Claims as the paper-to-code page words them, and the page of results."""
-
-
-def test_verdicts_are_those_of_the_records() -> None:
-    recorded = {
-        (re.sub(r" \(set \d\)$", "", claim), panel, recipe_name): verdict
-        for claim, panel, recipe_name, _, _, verdict in _rows("results.md", 6)
-    }
-    claim, told = "", {}
-    for row in _rows("paper_to_code.md", 7) + _rows("paper_to_code.md", 5):
-        claim = row[0] or claim
-        panel = row[4] if len(row) == 7 else row[2]
-        if claim in CLAIMS:
-            for recipe_name, verdict in zip(("paper", "hrlspec"), row[-2:], strict=True):
-                told[CLAIMS[claim], panel.strip("`"), recipe_name] = verdict
-    assert told == {key: verdict for key, verdict in recorded.items() if key[0] in CLAIMS.values()}
-
-
-def _rows(page: str, columns: int) -> list[list[str]]:
-    """Rows of the tables with so many columns."""
-    lines = [line for line in PAGES[page].splitlines() if line.startswith("|")]
-    rows = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
-    return [row for row in rows if len(row) == columns]
