@@ -65,6 +65,12 @@ def _point_mass(name: str, **overrides: Any) -> Environment:
     return PRESETS[name](**overrides)
 
 
+def _conveyor(**sizes: Any) -> Environment:
+    from envs_jax.conveyor.world import Conveyor
+
+    return Conveyor(**sizes)
+
+
 _REGISTRY: dict[str, Callable[..., Environment]] = {
     "letter": functools.partial(Letter, name="letter"),
     "letter12": functools.partial(Letter, name="letter12", num_letters=12, num_cells=24),
@@ -75,6 +81,8 @@ _REGISTRY: dict[str, Callable[..., Environment]] = {
     "zone-nm": functools.partial(_zone, "zone-nm"),
     "zone-jaxolotl": functools.partial(_point_mass, "zone-jaxolotl"),
     "zone-nm-jaxolotl": functools.partial(_point_mass, "zone-nm-jaxolotl"),
+    "conveyor": functools.partial(_conveyor, name="conveyor"),
+    "conveyor-simple": functools.partial(_conveyor, name="conveyor-simple", simple=True),
 }
 
 

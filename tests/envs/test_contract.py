@@ -16,8 +16,8 @@ import envs_jax
 from envs_jax.rooms.world import Rooms
 
 NUM = 8
-ONE_LAYOUT = {"walk"}
-"""Environments that show only a position: regions stay where they are, and so does the start."""
+ONE_LAYOUT = {"walk", "conveyor", "conveyor-simple"}
+"""Environments that show only a position: what there is stays where it is, and so does the start."""
 MAY_FAIL = {"flatworld", "zone", "zone-nm", "zone-jaxolotl", "zone-nm-jaxolotl"}
 """Environments whose episodes end where the square does."""
 
