@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -85,8 +85,12 @@ def train(
     config, chosen = world.settings(method, recipe, reward_set)
     config = evolve(config, {**(changes or {}), **({} if total_steps is None else {"total_steps": total_steps})})
     agent, machine = Agent(world.make(), config, chosen), world.rewards(reward_set)
-    reserved = _reserved(world, held_out)
-    return TrainedAgent(agent, _params(key, Trainer(agent), machine, reserved, progress), machine)
+    reserved, given = _reserved(world, held_out), world.collected_tasks(config.curriculum.max_nodes)
+    banks = [
+        TaskBanks(seed_of(one), config.curriculum, agent.env.num_propositions, reserved, given)
+        for one in jnp.atleast_1d(key)
+    ]
+    return TrainedAgent(agent, _params(key, Trainer(agent), machine, banks, reserved, progress), machine)
 
 
 def evaluate(
@@ -133,12 +137,12 @@ def _params(
     key: Key[Array, "*S"],
     trainer: Trainer,
     machine: RewardMachine,
+    banks: Sequence[TaskBanks],
     reserved: UInt32[np.ndarray, " _"],
     progress: Progress | None,
 ) -> Params:
-    """Parameters after all iterations, for one key or S keys."""
-    config, num_propositions = trainer.agent.config, trainer.agent.env.num_propositions
-    banks = [TaskBanks(seed_of(one), config.curriculum, num_propositions, reserved) for one in jnp.atleast_1d(key)]
+    """Parameters after all iterations, for one key or S keys, each with its banks."""
+    config = trainer.agent.config
     side_by_side = key.ndim > 0
     init, iterate = (_init_all, _iterate_all) if side_by_side else (Trainer.init, Trainer.iterate)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hrlspec.presets.conveyor import SERIES
 from hrlspec.presets.generic import preset_for
 from hrlspec.presets.letter import LETTER, LETTER12
 from hrlspec.presets.preset import Preset, Split
@@ -9,7 +10,7 @@ from hrlspec.presets.recipes import RECIPES, Recipe, RewardSet
 from hrlspec.presets.walk import FLATWORLD, WALK
 from hrlspec.presets.zone import ZONE, ZONE_JAXOLOTL, ZONE_LTL2ACTION, ZONE_NM, ZONE_NM_JAXOLOTL
 
-__all__ = ["PRESETS", "RECIPES", "Preset", "Recipe", "RewardSet", "Split", "preset", "preset_for"]
+__all__ = ["KNOWN", "PRESETS", "RECIPES", "Preset", "Recipe", "RewardSet", "Split", "preset", "preset_for"]
 
 PRESETS: dict[str, Preset] = {
     some.name: some
@@ -28,12 +29,19 @@ PRESETS: dict[str, Preset] = {
 """The presets by name."""
 
 
+KNOWN = ", ".join([*PRESETS, *(f"{series}-K (K items)" for series in SERIES)])
+"""What `preset` knows, in words."""
+
+
 def preset(name: str) -> Preset:
     """A preset by its name.
 
     Raises:
         ValueError: there is none; the message lists those there are.
     """
+    series, _, number = name.rpartition("-")
+    if series in SERIES and number.isdecimal():
+        return SERIES[series](int(number))
     if name not in PRESETS:
-        raise ValueError(f"unknown environment {name!r}, expected one of: {', '.join(PRESETS)}")
+        raise ValueError(f"unknown environment {name!r}, expected one of: {KNOWN}")
     return PRESETS[name]

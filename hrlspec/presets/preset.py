@@ -17,6 +17,7 @@ from hrlspec.methods import METHODS, ImplicitPlanner
 from hrlspec.presets.recipes import Recipe, RewardSet, Settings, recipe, with_bonuses
 from hrlspec.presets.suite_rules import VALIDATION, SuiteRule
 from hrlspec.presets.suites import SuiteError, hashes_of, packaged_hashes, packaged_suite
+from hrlspec.spec import TaskTree
 from hrlspec.tasks.rewards import Bonus, RewardMachine, reward_machine
 
 Split = Literal["validation", "test"]
@@ -44,6 +45,8 @@ class Preset:
             its like).
         suites: suites for test and validation by name, and how those in the files of this package were drawn.
         texts: the suites by name, one formula a line, where they are not in those files.
+        collected: the tasks that are collected on, in SPECTRL, where hardly any random task can be carried out. They
+            may be those of the suites: nothing is held out then.
         compiled_with: the effort that compiling programs is worth. Where matrix products, which are not compiled, are
             most of the time, the least.
     """
@@ -56,6 +59,7 @@ class Preset:
     learning_rates: Mapping[tuple[Recipe, str], float] = dataclasses.field(default_factory=dict)
     suites: Mapping[str, SuiteRule] = dataclasses.field(default_factory=dict)
     texts: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    collected: tuple[str, ...] = ()
     compiled_with: Effort = "most"
 
     def settings(
@@ -133,10 +137,19 @@ class Preset:
         Raises:
             SuiteError: a suite's file cannot be read.
         """
+        if self.collected:
+            return np.zeros(0, np.uint32)
         if self.suites:
             return packaged_hashes(self.name, tuple(self.suites), self.make().propositions)
         suites = [self.suite(name) for name in self.texts]
         return hashes_of([suite.take(np.flatnonzero(suite.depths > 1)) for suite in suites])
+
+    def collected_tasks(self, max_nodes: int) -> TaskTree | None:
+        """The tasks that are collected on, leading axis M, padded to ``max_nodes``; ``None`` for random ones."""
+        if not self.collected:
+            return None
+        text = "\n".join(self.collected)
+        return suite_from_text(f"{self.name}'s tasks", text, self.make().propositions, max_nodes=max_nodes).trees
 
 
 def named_method(name: str) -> Method:

@@ -88,10 +88,10 @@ class Learner:
         self._iterate_program = self._program("iterate", Trainer.iterate)
         self.machine = experiment.rewards
         self._reserved = jnp.asarray(preset.reserved)
+        curriculum = experiment.config.curriculum
         try:
-            self._banks = TaskBanks(
-                experiment.seed, experiment.config.curriculum, self.env.num_propositions, preset.reserved
-            )
+            given = preset.collected_tasks(curriculum.max_nodes)
+            self._banks = TaskBanks(experiment.seed, curriculum, self.env.num_propositions, preset.reserved, given)
         except ValueError as error:
             raise UserError(f"no training tasks with this --config.curriculum: {error}") from error
 

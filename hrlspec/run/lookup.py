@@ -12,7 +12,7 @@ from typing import Any
 
 from envs_jax import Environment
 from hrlspec.methods import METHODS, Method
-from hrlspec.presets import PRESETS, Preset, preset, preset_for
+from hrlspec.presets import Preset, preset, preset_for
 from hrlspec.run.errors import UserError, in_words
 from hrlspec.spec import SpecError, parse
 
@@ -39,9 +39,10 @@ def preset_named(name: str) -> Preset:
             except SpecError as error:
                 raise UserError(f"{name}: tasks cannot name the proposition {proposition!r}: {error}") from None
         return some
-    if name not in PRESETS:
-        raise UserError(f"unknown environment {name!r}, expected one of {', '.join(PRESETS)}, or module:factory")
-    return preset(name)
+    try:
+        return preset(name)
+    except ValueError as error:
+        raise UserError(f"{error}, or module:factory") from None
 
 
 @functools.cache

@@ -13,7 +13,7 @@ from tyro.conf import arg
 
 from hrlspec.config import Checked, Config, ConfigError, evolve, setting, without_copies
 from hrlspec.methods import METHODS, OURS, Method
-from hrlspec.presets import PRESETS, Recipe, RewardSet
+from hrlspec.presets import KNOWN, PRESETS, Recipe, RewardSet
 from hrlspec.run.errors import UserError
 from hrlspec.run.experiment import EvaluationConfig, Experiment
 from hrlspec.run.flags import flag_of, in_flags, parse_flags, settings_in
@@ -114,7 +114,7 @@ def _about() -> str:
     """What the help begins with."""
     methods = "\n".join(f"  {method.name}: {method.about}" for method in METHODS.values())
     return (
-        f"{' '.join(str(RunFlags.__doc__).split())}\n\nEnvironments: {', '.join(PRESETS)}; any other as "
+        f"{' '.join(str(RunFlags.__doc__).split())}\n\nEnvironments: {KNOWN}; any other as "
         "--env module:factory, where calling factory makes it; the module is looked for in the current directory "
         f"first.\n\nMethods, any other as --method module:VALUE:\n{methods}\n"
     )

@@ -27,16 +27,22 @@ class TaskBanks:
         config: of the curriculum.
         num_propositions: P.
         reserved: uint32, hashes of held-out tasks, which are never drawn.
+        given: tasks that are collected on, at all levels alike, instead of random ones; leading axis M.
 
     Raises:
         ValueError: no such task can be drawn.
     """
 
     def __init__(
-        self, seed: int, config: CurriculumConfig, num_propositions: int, reserved: UInt32[np.ndarray, " _"]
+        self,
+        seed: int,
+        config: CurriculumConfig,
+        num_propositions: int,
+        reserved: UInt32[np.ndarray, " _"],
+        given: TaskTree | None = None,
     ) -> None:
         self._seed, self._config, self._num_propositions = seed, config, num_propositions
-        self._reserved = reserved
+        self._reserved, self._given = reserved, given
         self._latest = 0, self._draw(0)
 
     def at(self, iteration: int) -> TaskTree:
@@ -47,6 +53,10 @@ class TaskBanks:
         return self._latest[1]
 
     def _draw(self, number: int) -> TaskTree:
+        if self._given is not None:
+            rows = np.arange(self._config.levels * self._config.tasks_per_level) % len(self._given.parent)
+            given: TaskTree = jax.tree.map(lambda x: jnp.asarray(x[rows]), self._given)
+            return given
         rng = np.random.default_rng([self._seed, number])
         bank: TaskTree = jax.tree.map(jnp.asarray, draw_bank(rng, self._config, self._num_propositions, self._reserved))
         return bank
