@@ -12,7 +12,7 @@ import envs_jax
 from envs_jax.zone import point_mass
 from envs_jax.zone.layouts import COLOURS
 from hrlspec.presets.preset import Preset
-from hrlspec.presets.recipes import Recipe, Settings, continuous, once, twice
+from hrlspec.presets.recipes import Recipe, Settings, continuous
 from hrlspec.presets.suite_rules import (
     NUM_TASKS,
     REACH,
@@ -45,7 +45,7 @@ def zone(settings: Settings, recipe: Recipe) -> Settings:
     if recipe != "hrlspec":
         return _of_paper(settings)
     # An episode takes longer than a rollout, and drawing contested layouts was an eighth of an iteration.
-    return once(settings, minibatches=20).evolve({"config.steps_per_slot": 64})
+    return settings.evolve({"config.steps_per_slot": 64})
 
 
 def _of_paper(settings: Settings) -> Settings:
@@ -70,7 +70,7 @@ def _of_paper(settings: Settings) -> Settings:
 def zone_with_bonuses(settings: Settings, recipe: Recipe) -> Settings:
     """Reward set 2, where orders of colours pay ten and twenty times as much as a sub-task."""
     # Beside the critic's errors what a step gains is small: paid for entropy, the policy came to act at random.
-    return settings if recipe != "hrlspec" else twice(settings).evolve({"config.low.entropy": 0.0})
+    return settings if recipe != "hrlspec" else settings.evolve({"config.low.entropy": 0.0})
 
 
 _BONUSES = (Bonus("green", "red", 10.0), Bonus("red", "blue", 20.0, ("yellow",)))
