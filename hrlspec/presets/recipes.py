@@ -60,32 +60,6 @@ def with_bonuses(settings: Settings, name: Recipe) -> Settings:
     )
 
 
-def once(settings: Settings, minibatches: int) -> Settings:
-    """The low level goes through its steps once, for reward set 1, whose returns are 1 at most.
-
-    The critic's squared errors are a hundredth or less then. Its values choose the way: without the larger weight the
-    choice suffers from half as many passes.
-    """
-    return settings.evolve(
-        {
-            "config.low.optimiser.epochs": 1,
-            "config.low.optimiser.minibatches": minibatches,
-            "config.low.value_coefficient": 4.0,
-        }
-    )
-
-
-def twice(settings: Settings) -> Settings:
-    """Undoes `once` under reward set 2, whose returns, and with them the critic's errors, are larger."""
-    return settings.evolve(
-        {
-            "config.low.optimiser.epochs": 2,
-            "config.low.optimiser.minibatches": 16,
-            "config.low.value_coefficient": 0.5,
-        }
-    )
-
-
 def continuous(settings: Settings, learning_rate: float) -> Settings:
     """What worlds of small steps and Gaussian actions share: long rollouts, few decisions, coloured noise.
 
