@@ -12,7 +12,7 @@ from typing import Any
 
 from envs_jax import Environment
 from hrlspec.methods import METHODS, Method
-from hrlspec.presets import Preset, preset, preset_for
+from hrlspec.presets import KNOWN, Preset, find_preset, preset_for
 from hrlspec.run.errors import UserError, in_words
 from hrlspec.spec import SpecError, parse
 
@@ -40,9 +40,12 @@ def preset_named(name: str) -> Preset:
                 raise UserError(f"{name}: tasks cannot name the proposition {proposition!r}: {error}") from None
         return some
     try:
-        return preset(name)
+        known = find_preset(name)
     except ValueError as error:
-        raise UserError(f"{error}, or module:factory") from None
+        raise UserError(str(error)) from None
+    if known is None:
+        raise UserError(f"unknown environment {name!r}, expected one of {KNOWN}, or module:factory")
+    return known
 
 
 @functools.cache

@@ -24,7 +24,8 @@ from hrlspec.run.run_flags import experiments_of, parse_run, schedules_moved
 ROOT = Path(__file__).parents[2]
 
 BAD_FLAGS = [
-    ("--env zones", "unknown environment 'zones', expected one of: letter, letter12"),
+    ("--env zones", "unknown environment 'zones', expected one of letter, letter12"),
+    ("--env conveyor-33", "environment 'conveyor-33': k is 33, expected 1 to 32"),
     ("--env", "Missing value for argument '--env'"),
     ("--env nowhere:make", "nowhere:make cannot be used: ModuleNotFoundError: No module named 'nowhere'"),
     ("--env os:nothing", "module 'os' has no attribute 'nothing'"),
