@@ -62,11 +62,14 @@ class ImplicitPlanner(Checked, HighLevel):
     values. Off: it is asked about the tree, and a policy of its own chooses, as in the paper."""
     inverse_temperature: float = setting(400.0, least=0, most=1e6)
     """Weight of these values in the logits."""
+    tells_path: bool = False
+    """Where paths are valued: whether the low level is told the best path through the edge that it is given, instead of
+    the tree that remains."""
 
     @property
     def follows_plan(self) -> bool:
-        """With the low level's advice the plan is the path that it values most."""
-        return self.network.advice > 0 and not self.values_paths
+        """The plan is the path that V^h values most, or, with the low level's advice, that it values most itself."""
+        return self.tells_path if self.values_paths else self.network.advice > 0
 
     def num_samples(self, config: Config) -> int:
         """See :class:`HighLevel`."""
@@ -144,9 +147,7 @@ class ImplicitPlanner(Checked, HighLevel):
 
         values = self._value_of_paths(value, paths.known, each)
         advice, row, has_one = jax.vmap(best_of_edges, in_axes=(0, 0, None))(paths, values, tree.parent.shape[1])
-        best = jax.vmap(lambda ahead, row: ahead[row])(each.ahead, row)
-        ahead = jnp.where(has_one[..., None, None], best, instructions.ahead)
-        return jax.lax.stop_gradient(advice), ahead
+        return jax.lax.stop_gradient(advice), _ahead_on(each.ahead, row, has_one, instructions)
 
     def loss(
         self, low: LowLevel, params: Any, batch: HighBatch, progress: Float32[Array, ""]
@@ -203,7 +204,7 @@ class ImplicitPlanner(Checked, HighLevel):
 
     def _instructions(self, low: LowLevel, tree: TaskTree, paths: Paths, instructions: Instruction) -> Instruction:
         """The instructions for the first sub-tasks of one environment's paths, ``[L]``."""
-        later = paths.nodes[:, 1:]
+        later = paths.nodes[:, 1 : 1 + instructions.ahead.shape[1]]
         ahead = tree.reach[later] & (later >= 0)[..., None] & (low.sees == "future")
         return dataclasses.replace(take(instructions, paths.edge), ahead=ahead.astype(jnp.float32))
 
@@ -226,7 +227,7 @@ class ImplicitPlanner(Checked, HighLevel):
     ) -> Choice:
         """Edges by V^h of the best path through each, all edges beside the path being blocked."""
         planner, own, num_nodes = self.planner(low), params["high"], tree.parent.shape[1]
-        length = self._length(num_nodes)
+        length = max(self._length(num_nodes), 1 + instructions.ahead.shape[2])
         paths = jax.vmap(lambda tree, state: open_paths(tree, state, self.advised, length))(tree, state)
         each = jax.vmap(jax.vmap(sequence, in_axes=(None, None, 0)))(tree, state.node, paths.nodes)
         latent = jax.vmap(lambda view: planner.apply(own, view, method="encode"))(view)
@@ -237,12 +238,15 @@ class ImplicitPlanner(Checked, HighLevel):
             return cast(Array, worth(take(latent, env), path))
 
         values = self._value_of_paths(value, paths.known, each)
-        of_edges, row, _ = jax.vmap(best_of_edges, in_axes=(0, 0, None))(paths, values, num_nodes)
+        of_edges, row, has_one = jax.vmap(best_of_edges, in_axes=(0, 0, None))(paths, values, num_nodes)
         feasible = jax.vmap(open_edges)(tree, state)
         best = jnp.where(feasible.any(1), jnp.where(feasible, of_edges, -jnp.inf).max(1), 0.0)
         logits = jnp.where(feasible, self.inverse_temperature * (of_edges - best[:, None]), MASKED)
-        leaf = jnp.take_along_axis(paths.leaf, row, 1)
-        return Choice(logits, best, jnp.zeros_like(of_edges), instructions.ahead, leaf)
+        leaf, ahead = jnp.take_along_axis(paths.leaf, row, 1), instructions.ahead
+        if self.tells_path:
+            told = jax.vmap(self._instructions, in_axes=(None, 0, 0, 0))(low, tree, paths, instructions).ahead
+            ahead = _ahead_on(told, row, has_one, instructions)
+        return Choice(logits, best, jnp.zeros_like(of_edges), ahead, leaf)
 
     def _loss_of_paths(self, low: LowLevel, params: Any, batch: HighBatch) -> tuple[Float32[Array, ""], Metrics]:
         """The error of V^h of the paths that were meant to be taken, and the TransE loss."""
@@ -259,6 +263,17 @@ class ImplicitPlanner(Checked, HighLevel):
     def _length(self, num_nodes: int) -> int:
         """Sub-tasks of a path that are seen: as many as there are rounds of message passing, if these have a limit."""
         return min(self.network.rounds or num_nodes, num_nodes - 1)
+
+
+def _ahead_on(
+    ahead: Float32[Array, "B L D P"],
+    row: Int32[Array, "B N"],
+    has_one: Bool[Array, "B N"],
+    instructions: Instruction,
+) -> Float32[Array, "B N D P"]:
+    """What lies ahead on the best path through each edge, which is in the given row if it has one."""
+    best = jax.vmap(lambda ahead, row: ahead[row])(ahead, row)
+    return jnp.where(has_one[..., None, None], best, instructions.ahead)
 
 
 def _distance(x: Float32[Array, "B latent"], y: Float32[Array, "B latent"]) -> Float32[Array, " B"]:

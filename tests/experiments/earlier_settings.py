@@ -66,7 +66,11 @@ def dotted(settings: Any, prefix: str = "") -> dict[str, Any]:
 
 
 ADDED = {"config.blocks": 1, "evaluation.final": "test"}
-ADDED_TO_PLANNERS = {f"{_PLANNER}.values_paths": False, f"{_PLANNER}.inverse_temperature": 400.0}
+ADDED_TO_PLANNERS = {
+    f"{_PLANNER}.values_paths": False,
+    f"{_PLANNER}.inverse_temperature": 400.0,
+    f"{_PLANNER}.tells_path": False,
+}
 """What records lack that are older than these settings, and what they would have said."""
 BEFORE = {
     "config.blocks": (1,),

@@ -13,6 +13,7 @@ import pytest
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.distributions import MASKED
 from hrlspec.agent.experience import Credit, HighBatch, undecided
+from hrlspec.config import evolve
 from hrlspec.methods import Ours
 from hrlspec.methods.ours import ImplicitPlanner
 from hrlspec.methods.paths import Paths, best_of_edges, open_paths, sequence
@@ -108,6 +109,23 @@ def test_the_choice_follows_the_values_of_paths_asked_one_by_one(rounds: int) ->
     assert (choice.logits[:, [0, 3, 4, 5]] == MASKED).all()
     np.testing.assert_array_equal(choice.leaf[:, 1], np.where(each[3] >= each[4], 3, 4))
     np.testing.assert_array_equal(choice.leaf[:, 2], 5)
+
+
+def test_the_low_level_is_told_the_path_that_is_meant() -> None:
+    """Its later sub-tasks, and nothing after its end; of an edge that is not open, all that may come."""
+    config = evolve(small_config(), {"network.roles": True, "network.lookahead": 2})
+    agent = Agent(ENV, config, Ours(high=small_planner(values_paths=True, tells_path=True, network__rounds=0)))
+    assert agent.high.follows_plan
+    params, tree = random_params(agent, 0), on_device(TREE)
+    views = ENV.view_at(np.array([1, 2]))
+    alike = jax.tree.map(lambda x: jnp.stack([x] * 2), (tree, initial(tree), agent.low.instruct(params, tree)))
+    choice = jax.tree.map(np.asarray, quick_jit(agent.high.choose, static_argnums=0)(agent.low, params, views, *alike))
+    for env in range(2):
+        for edge, path in ((1, [1, int(choice.leaf[env, 1])]), (2, [2, 5])):
+            expected = np.zeros((2, 4))
+            expected[0] = np.asarray(TREE.reach)[path[1]]
+            np.testing.assert_array_equal(choice.ahead[env, edge], expected)
+        np.testing.assert_array_equal(choice.ahead[env, 0], alike[2].ahead[env, 0])
 
 
 def test_the_loss_is_the_error_of_the_path_that_was_meant() -> None:
