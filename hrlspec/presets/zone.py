@@ -42,10 +42,7 @@ def zone(settings: Settings, recipe: Recipe) -> Settings:
             "config.curriculum.max_avoid": 2,
         }
     )
-    if recipe != "hrlspec":
-        return _of_paper(settings)
-    # An episode takes longer than a rollout, and drawing contested layouts was an eighth of an iteration.
-    return settings.evolve({"config.steps_per_slot": 64})
+    return settings if recipe == "hrlspec" else _of_paper(settings)
 
 
 def _of_paper(settings: Settings) -> Settings:

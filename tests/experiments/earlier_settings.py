@@ -75,7 +75,6 @@ ADDED_TO_PLANNERS = {
 BEFORE = {
     "config.blocks": (1,),
     "config.group": (8, 32),
-    "config.steps_per_slot": (32,),
     "config.low.optimiser.epochs": (2,),
     "config.low.optimiser.minibatches": (16,),
     "config.low.value_coefficient": (0.5,),
