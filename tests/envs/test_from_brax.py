@@ -158,6 +158,7 @@ def test_braxs_wrappers() -> None:
         from_brax(brax.create("fast", batch_size=2, auto_reset=False), labels, horizon=4)
 
 
+@pytest.mark.slow  # brax compiles for long
 @pytest.mark.filterwarnings("ignore:Brax System", "ignore:Accessing `.*` directly from `Data`:DeprecationWarning")
 def test_reacher_goes_where_brax_has_it_go() -> None:
     brax = _brax()

@@ -164,7 +164,7 @@ def test_the_family_is_every_claim_wherever_its_curves_are() -> None:
 def test_findings() -> None:
     rng = np.random.default_rng(0)
 
-    def verdicts(ours: float, option: float, seeds: int = 10) -> dict[str, str]:
+    def verdicts(ours: float, option: float, seeds: int = 8) -> dict[str, str]:
         means = {Curve("ours", "paper"): ours, Curve("option", "paper"): option}
         some = {c: [record([0.5], final=m + 0.01 * rng.normal()) for _ in range(seeds)] for c, m in means.items()}
         return {test.claim.text: found.verdict for test, found in findings({"walk-set2": some}).items()}

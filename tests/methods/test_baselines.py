@@ -167,7 +167,8 @@ def test_measurements_are_sums_over_attempts_that_fade() -> None:
             np.testing.assert_allclose(known.rewards[kind, g], reward[mine].sum(), rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("method", ["option", pytest.param("ltl2action", marks=pytest.mark.slow)])
+@pytest.mark.slow  # compiles an iteration of each
+@pytest.mark.parametrize("method", ["option", "ltl2action"])
 def test_baselines_train_in_the_same_loop(method: str) -> None:
     """A corridor with the start in the middle: each baseline learns to go to what it is told."""
     agent = baseline(method, total_steps=60 * 32 * 24)
