@@ -28,6 +28,7 @@ ENV = Corridor(cells=("a", "", "bc", "", "d", "", ""), starts=(1, 3, 5), horizon
 CONFIG = evolve(small_config(num_envs=128, blocks=4), {"curriculum.promotion": 0.3})
 MACHINE = reward_machine(ENV.propositions, subtask=0.5)
 ITERATIONS = 30
+SLOW = pytest.mark.slow  # compiling for each number of devices takes most of the time
 
 
 class Measuring(ImplicitPlanner):
@@ -95,7 +96,7 @@ def test_an_iteration_does_not_depend_on_the_number_of_devices() -> None:
     assert int(state.curriculum.level) > 0  # and with it the counts of all devices
 
 
-@pytest.mark.slow  # compiling for each number of devices takes most of the time
+@SLOW
 @pytest.mark.skipif(jax.__version_info__ < (0, 10, 2), reason="XLA adds up a bias's gradient in another order")
 @pytest.mark.parametrize("devices", [2, 4])
 def test_nor_does_a_run_to_the_bit(devices: int) -> None:
@@ -103,7 +104,7 @@ def test_nor_does_a_run_to_the_bit(devices: int) -> None:
     assert hashes[0] == hashes[1]
 
 
-@pytest.mark.parametrize(("before", "after"), [(1, 4), (4, 1), pytest.param(2, 4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("before", "after"), [(1, 4), *(pytest.param(n, m, marks=SLOW) for n, m in ((4, 1), (2, 4)))])
 def test_a_checkpoint_goes_on_on_another_number_of_devices(before: int, after: int, tmp_path: Path) -> None:
     state = trained(fresh(before), before, 1)
     checkpoint.save(tmp_path, 1, state)
