@@ -7,6 +7,7 @@ import functools
 from collections.abc import Callable, Mapping
 from typing import Literal
 
+import jax
 import numpy as np
 
 from envs_jax import Environment
@@ -17,7 +18,7 @@ from hrlspec.methods import METHODS, ImplicitPlanner
 from hrlspec.presets.recipes import Recipe, RewardSet, Settings, recipe, with_bonuses
 from hrlspec.presets.suite_rules import VALIDATION, SuiteRule
 from hrlspec.presets.suites import SuiteError, hashes_of, packaged_hashes, packaged_suite
-from hrlspec.spec import TaskTree
+from hrlspec.spec import TaskTree, compile_task, parse
 from hrlspec.tasks.rewards import Bonus, RewardMachine, reward_machine
 
 Split = Literal["validation", "test"]
@@ -145,11 +146,17 @@ class Preset:
         return hashes_of([suite.take(np.flatnonzero(suite.depths > 1)) for suite in suites])
 
     def collected_tasks(self, max_nodes: int) -> TaskTree | None:
-        """The tasks that are collected on, leading axis M, padded to ``max_nodes``; ``None`` for random ones."""
+        """The tasks that are collected on, leading axis M, padded to ``max_nodes``; ``None`` for random ones.
+
+        Raises:
+            SpecError: one has a tree of more nodes.
+        """
         if not self.collected:
             return None
-        text = "\n".join(self.collected)
-        return suite_from_text(f"{self.name}'s tasks", text, self.make().propositions, max_nodes=max_nodes).trees
+        propositions = self.make().propositions
+        trees = [compile_task(parse(text), propositions, max_nodes, on_host=True) for text in self.collected]
+        given: TaskTree = jax.tree.map(lambda *x: np.stack(x), *trees)
+        return given
 
 
 def named_method(name: str) -> Method:

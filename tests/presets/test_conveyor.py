@@ -20,6 +20,7 @@ def test_the_tasks_are_two_chains_that_differ_in_the_end(name: str, k: int) -> N
     assert (world.name, env.name, env.num_propositions) == (name, name, k + 1)
     trees = world.collected_tasks(config.curriculum.max_nodes)
     assert trees is not None
+    assert trees.parent.shape == (2, config.curriculum.max_nodes)
     reach = np.asarray(trees.reach).argmax(-1)[:, 1 : k + 1]
     common = list(range(k - 1))
     assert reach.tolist() == [[*common, k - 1], [*common, k]]
