@@ -162,7 +162,7 @@ TRIED: dict[tuple[str, Recipe], dict[str, tuple[float, ...]]] = {
     ("zone", "paper"): _around(1.4e-3, 7e-4, 1.4e-3),
     ("zone", "hrlspec"): _around(1.4e-3, 1.4e-3, 1.4e-3),
 }
-"""Learning rates of the low level that were tried for each method, until the best was none of the outer ones."""
+"""Learning rates of the low level to try for each method, until the best is none of the outer ones."""
 TRIAL_SEEDS = 3
 
 
@@ -182,7 +182,7 @@ TUNING = {
     )
     for env in ENVIRONMENTS
 }
-"""What the learning rates in ``presets.py`` were chosen by, with seeds and tasks that no panel uses."""
+"""What learning rates are to be chosen by, with seeds and tasks that no panel uses."""
 
 TRAJECTORIES = "walk-trajectories"
 """The figure of trained agents' ways in Walk, which needs a run's checkpoint and not only its record."""

@@ -31,34 +31,26 @@ _LEARNING_RATES: dict[tuple[Recipe, str], float] = {
 }
 
 
+def _learning(settings: Settings, recipe: Recipe, epochs: int, minibatches: int, weight: float) -> Settings:
+    """How often the low level goes through its steps under ``hrlspec``, and what its critic's error weighs."""
+    changes = {"optimiser.epochs": epochs, "optimiser.minibatches": minibatches, "value_coefficient": weight}
+    if recipe != "hrlspec":
+        return settings
+    return settings.evolve({f"config.low.{name}": value for name, value in changes.items()})
+
+
 def letter(settings: Settings, recipe: Recipe) -> Settings:
     """A recipe as it is, but that under ``hrlspec`` the low level goes through its steps once.
 
     Returns are 1 at most, and the critic's squared errors a hundredth or less. Its values choose the way: without the
     larger weight the choice suffers from half as many passes.
     """
-    if recipe != "hrlspec":
-        return settings
-    return settings.evolve(
-        {
-            "config.low.optimiser.epochs": 1,
-            "config.low.optimiser.minibatches": 40,
-            "config.low.value_coefficient": 4.0,
-        }
-    )
+    return _learning(settings, recipe, epochs=1, minibatches=40, weight=4.0)
 
 
 def letter_with_bonuses(settings: Settings, recipe: Recipe) -> Settings:
     """Reward set 2, whose returns, and with them the critic's errors, are larger: twice, as is the default."""
-    if recipe != "hrlspec":
-        return settings
-    return settings.evolve(
-        {
-            "config.low.optimiser.epochs": 2,
-            "config.low.optimiser.minibatches": 16,
-            "config.low.value_coefficient": 0.5,
-        }
-    )
+    return _learning(settings, recipe, epochs=2, minibatches=16, weight=0.5)
 
 
 def _twelve(settings: Settings, recipe: Recipe) -> Settings:
