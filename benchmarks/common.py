@@ -160,7 +160,7 @@ def training(name: str, recipe: Recipe, seconds: float, devices: int) -> dict[st
         tasks = jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank)
         book = agent.low.prepare(state.params, tasks)
         envs = jnp.arange(config.num_envs, dtype=jnp.int32)
-        pool = fill_pool(jax.random.key(1), agent, book, state.curriculum.level, envs, size=config.episode_slots)
+        pool = fill_pool(jax.random.key(1), agent, book, state.curriculum.level, envs, size=config.episode_slots - 1)
         setting = Setting(agent, state.params, machine, book, pool, envs)
         return collect(jax.random.key(2), setting, collector, config.noise_correlation)[0]
 

@@ -78,7 +78,7 @@ def parts(name: str, recipe: Recipe, iterations: int, seconds: float) -> dict[st
     def setting(state: Any) -> Setting:
         tasks = jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank)
         book = agent.low.prepare(state.params, tasks)
-        pool = fill_pool(key, agent, book, state.curriculum.level, envs, size=config.episode_slots)
+        pool = fill_pool(key, agent, book, state.curriculum.level, envs, size=config.episode_slots - 1)
         return Setting(agent, state.params, machine, book, pool, envs)
 
     def rollout(state: Any) -> Any:

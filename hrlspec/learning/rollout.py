@@ -216,7 +216,7 @@ def _step(setting: Setting, carry: tuple[Collector, _Reach], chance: _Chance) ->
     worker, outcome = transition(step_keys, agent.env, setting.machine, book, before, low.action)
     ended = outcome.terminated | outcome.truncated
     started = collector.started + ended
-    fresh = take(pool, jnp.arange(num_envs, dtype=jnp.int32), started % pool.task.shape[1])
+    fresh = take(pool, jnp.arange(num_envs, dtype=jnp.int32), (started - 1) % pool.task.shape[1])
     after = if_any(lambda: start(reset_keys, agent.env, setting.machine, book, fresh.layout, fresh.task), ended, worker)
     reached = _reach_values(setting, worker.view)
     decision, bootstrap = _plan(setting, after, worker, outcome.truncated, chance.high)

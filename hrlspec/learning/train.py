@@ -141,7 +141,7 @@ class Trainer:
             state.collector,
             worker=dataclasses.replace(state.collector.worker, task=jnp.arange(len(envs), dtype=jnp.int32)),
         )
-        pool = fill_pool(keys[0], agent, book, state.curriculum.level, envs, size=config.episode_slots)
+        pool = fill_pool(keys[0], agent, book, state.curriculum.level, envs, size=config.episode_slots - 1)
         correlation = annealed(config.noise_correlation, config.final_noise_correlation, progress)
         setting = Setting(agent, state.params, machine, book, pool, envs)
         collector, steps = collect(keys[1], setting, collector, correlation)
