@@ -25,7 +25,7 @@ from hrlspec.evaluation import Suite, SuiteResult, evaluate_suite, suite_from_te
 from hrlspec.learning.train import Trainer, TrainState
 from hrlspec.presets import Preset, Recipe, RewardSet, preset, preset_for
 from hrlspec.spec import TaskTree
-from hrlspec.tasks.bank import TaskBanks, seed_of
+from hrlspec.tasks.bank import TaskBanks, joint_labels, seed_of
 from hrlspec.tasks.rewards import RewardMachine
 
 Progress = Callable[[int, Mapping[str, Shaped[np.ndarray, "..."]]], object]
@@ -86,8 +86,9 @@ def train(
     config = evolve(config, {**(changes or {}), **({} if total_steps is None else {"total_steps": total_steps})})
     agent, machine = Agent(world.make(), config, chosen), world.rewards(reward_set)
     reserved, given = _reserved(world, held_out), world.collected_tasks(config.curriculum.max_nodes)
+    together = joint_labels(agent.env, config.curriculum)
     banks = [
-        TaskBanks(seed_of(one), config.curriculum, agent.env.num_propositions, reserved, given)
+        TaskBanks(seed_of(one), config.curriculum, agent.env.num_propositions, reserved, given, together)
         for one in jnp.atleast_1d(key)
     ]
     return TrainedAgent(agent, _params(key, Trainer(agent), machine, banks, reserved, progress), machine)

@@ -173,6 +173,8 @@ class CurriculumConfig(Checked):
     contested: float = setting(0.0, least=0, most=1)
     """Share of episodes in layouts made to teach look-ahead, where nearest-first loses; in environments that are
     `envs_jax.ContestedLayouts`."""
+    joint: float = setting(0.0, least=0, most=1)
+    """Share of sub-tasks that ask for propositions at once, in worlds where some can hold together."""
     max_branching: int = setting(3, least=1)
     max_avoid: int = setting(3, least=0)
     tasks_per_level: int = setting(512, least=1)

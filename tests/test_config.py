@@ -78,6 +78,7 @@ BOUNDS: dict[type, dict[str, tuple[float, float]]] = {
         "window": (0, INF),
         "earlier": (0, 1),
         "tree_share": (0, 1),
+        "joint": (0, 1),
         "contested": (0, 1),
         "max_branching": (1, INF),
         "max_avoid": (0, INF),

@@ -33,7 +33,7 @@ from hrlspec.run.errors import UserError
 from hrlspec.run.experiment import Experiment
 from hrlspec.run.loop import Job
 from hrlspec.run.programs import Program
-from hrlspec.tasks.bank import TaskBanks
+from hrlspec.tasks.bank import TaskBanks, joint_labels
 
 PERIODIC_TASKS = (1, 2, 5, 10)  # the most there are; each divides the number of episodes
 _LAYOUTS: dict[Split, int] = {"validation": 1, "test": 2}
@@ -91,7 +91,9 @@ class Learner:
         curriculum = experiment.config.curriculum
         try:
             given = preset.collected_tasks(curriculum.max_nodes)
-            self._banks = TaskBanks(experiment.seed, curriculum, self.env.num_propositions, preset.reserved, given)
+            together = joint_labels(self.env, curriculum)
+            number = self.env.num_propositions
+            self._banks = TaskBanks(experiment.seed, curriculum, number, preset.reserved, given, together)
         except ValueError as error:
             raise UserError(f"no training tasks with this --config.curriculum: {error}") from error
 

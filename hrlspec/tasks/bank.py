@@ -1,6 +1,6 @@
 """Banks of training tasks, drawn anew as training goes on.
 
-Axes: **L** levels, **M** tasks per level.
+Axes: **L** levels, **M** tasks per level, **J** sets of propositions that hold together.
 """
 
 from __future__ import annotations
@@ -8,8 +8,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Key, UInt32
+from jaxtyping import Bool, Key, UInt32
 
+from envs_jax import Environment
 from envs_jax.arrays import Array
 from hrlspec.config import CurriculumConfig
 from hrlspec.spec import TaskTree
@@ -28,6 +29,7 @@ class TaskBanks:
         num_propositions: P.
         reserved: uint32, hashes of held-out tasks, which are never drawn.
         given: tasks that are collected on, at all levels alike, instead of random ones; leading axis M.
+        together: bool ``[J, P]``, sets of propositions that goals may be, see `joint_labels`.
 
     Raises:
         ValueError: no such task can be drawn.
@@ -40,9 +42,10 @@ class TaskBanks:
         num_propositions: int,
         reserved: UInt32[np.ndarray, " _"],
         given: TaskTree | None = None,
+        together: Bool[np.ndarray, "J P"] | None = None,
     ) -> None:
         self._seed, self._config, self._num_propositions = seed, config, num_propositions
-        self._reserved, self._given = reserved, given
+        self._reserved, self._given, self._together = reserved, given, together
         self._latest = 0, self._draw(0)
 
     def at(self, iteration: int) -> TaskTree:
@@ -58,8 +61,17 @@ class TaskBanks:
             given: TaskTree = jax.tree.map(lambda x: jnp.asarray(x[rows]), self._given)
             return given
         rng = np.random.default_rng([self._seed, number])
-        bank: TaskTree = jax.tree.map(jnp.asarray, draw_bank(rng, self._config, self._num_propositions, self._reserved))
+        drawn = draw_bank(rng, self._config, self._num_propositions, self._reserved, self._together)
+        bank: TaskTree = jax.tree.map(jnp.asarray, drawn)
         return bank
+
+
+def joint_labels(env: Environment, config: CurriculumConfig) -> Bool[np.ndarray, "J P"] | None:
+    """The sets of two propositions or more that can hold together in a world; ``None`` if no goal is to be one."""
+    if not config.joint:
+        return None
+    sets = [[name in label for name in env.propositions] for label in env.possible_labels if len(label) > 1]
+    return np.array(sets, bool).reshape(-1, env.num_propositions)
 
 
 def seed_of(key: Key[Array, ""]) -> int:

@@ -1,6 +1,6 @@
 """The training curriculum: its levels, the promotion between them and their tasks (paper, "Training Curriculum").
 
-Axes: **L** levels, **M** tasks per level, **S** tasks drawn.
+Axes: **L** levels, **M** tasks per level, **S** tasks drawn, **J** sets of propositions that hold together.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Float32, Int, Int32, UInt32
+from jaxtyping import Bool, Float32, Int, Int32, UInt32
 
 from envs_jax.arrays import Array
 from hrlspec.config import CurriculumConfig
@@ -69,23 +69,25 @@ def draw_levels(chance: Float32[Array, "2 S"], level: Int32[Array, ""], earlier:
 
 
 def draw_bank(
-    rng: np.random.Generator, config: CurriculumConfig, num_propositions: int, reserved: UInt32[np.ndarray, " _"]
+    rng: np.random.Generator,
+    config: CurriculumConfig,
+    num_propositions: int,
+    reserved: UInt32[np.ndarray, " _"],
+    together: Bool[np.ndarray, "J P"] | None = None,
 ) -> TaskTree:
     """A bank of L·M training tasks, level by level; none of them has a reserved hash.
 
-    Level k holds sequences of k sub-tasks and, for a share ``tree_share``, random trees of depth k.
+    Level k holds sequences of k sub-tasks and, for a share ``tree_share``, random trees of depth k. A share ``joint``
+    of their edges reaches one of the sets in ``together``, bool ``[J, P]``.
     """
     levels = []
     num_trees = round(config.tree_share * config.tasks_per_level)
     common: dict[str, Any] = {"num_propositions": num_propositions, "max_nodes": config.max_nodes, "reserved": reserved}
+    common |= {"max_avoid": config.max_avoid, "joint": config.joint, "together": together}
     for level in range(1, config.levels + 1):
         parts = []
         if num_trees < config.tasks_per_level:
-            parts.append(
-                sample_sequences(
-                    rng, level=level, num_tasks=config.tasks_per_level - num_trees, max_avoid=config.max_avoid, **common
-                )
-            )
+            parts.append(sample_sequences(rng, level=level, num_tasks=config.tasks_per_level - num_trees, **common))
         if num_trees:
             parts.append(
                 sample_trees(
@@ -94,7 +96,6 @@ def draw_bank(
                     min_depth=level,
                     max_depth=level,
                     max_branching=config.max_branching,
-                    max_avoid=config.max_avoid,
                     **common,
                 )
             )

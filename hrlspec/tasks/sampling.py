@@ -1,12 +1,16 @@
 """Random tasks: sequences for the curriculum and random trees (paper, "Training Curriculum" and "Experience Replay").
 
-Rules for both: an edge reaches one proposition; its ``ensuring`` part has a uniformly random size in
-0..min(max_avoid, P - 2) and contains neither what the edge reaches nor what the edge before it reached; no
-edge reaches what the edge before it reached; edges out of one node reach different propositions.
+Rules for both: an edge reaches one proposition, or a set that holds together (below); its ``ensuring`` part has a
+uniformly random size in 0..min(max_avoid, P - 2) and contains neither what the edge reaches nor what the edge before it
+reached; no edge reaches what the edge before it reached; edges out of one node reach different propositions or sets.
+
+Where propositions can hold together, a share of the edges, ``joint``, reaches one of the sets in ``together`` that its
+proposition is part of, so far as there is one and the rules allow it.
 
 Everything is vectorised over tasks and stays on the host: results have NumPy leaves with a leading axis M.
 
-Axes: **M** tasks, **D** those of them that are drawn, **N** tree nodes, **P** atomic propositions.
+Axes: **M** tasks, **D** those of them that are drawn, **N** tree nodes, **P** atomic propositions, **J** sets that hold
+together.
 """
 
 from __future__ import annotations
@@ -31,6 +35,8 @@ def sample_sequences(
     num_propositions: int,
     max_nodes: int,
     max_avoid: int = 3,
+    joint: float = 0.0,
+    together: Bool[np.ndarray, "J P"] | None = None,
     reserved: UInt32[np.ndarray, "..."] | None = None,
 ) -> TaskTree:
     """Sequences of ``level`` random sub-tasks, the curriculum's tasks of that level.
@@ -42,6 +48,8 @@ def sample_sequences(
         num_propositions: P.
         max_nodes: N.
         max_avoid: largest ``ensuring`` part of an edge.
+        joint: share of the edges that reach a set.
+        together: bool ``[J, P]``, sets of propositions that can hold together.
         reserved: uint32 ``[...]``, hashes of held-out tasks, which are drawn again.
 
     Returns:
@@ -66,6 +74,7 @@ def sample_sequences(
         trees.valid[:, : level + 1] = True
         trees.accepting[:, level] = True
         trees.reach[:, 1 : level + 1] = np.eye(num_propositions, dtype=bool)[goals]
+        _join(rng, trees, joint, together)
         _draw_avoid(rng, trees, max_avoid)
         return trees
 
@@ -83,6 +92,8 @@ def sample_trees(
     max_branching: int,
     max_avoid: int = 3,
     min_leaves: int = 1,
+    joint: float = 0.0,
+    together: Bool[np.ndarray, "J P"] | None = None,
     reserved: UInt32[np.ndarray, "..."] | None = None,
 ) -> TaskTree:
     """Random trees: the unseen tasks of the evaluation and, by recipe, of the collection.
@@ -103,6 +114,8 @@ def sample_trees(
         max_branching: most children of a node; P limits it too, as siblings reach different propositions.
         max_avoid: largest ``ensuring`` part of an edge.
         min_leaves: fewest leaves of every tree.
+        joint: share of the edges that reach a set.
+        together: bool ``[J, P]``, sets of propositions that can hold together.
         reserved: uint32 ``[...]``, hashes of held-out tasks, which are drawn again.
 
     Returns:
@@ -130,6 +143,7 @@ def sample_trees(
     def draw(which: Int[np.ndarray, " D"]) -> TaskTree:
         trees = _blank(len(which), max_nodes, num_propositions)
         _grow(rng, trees, depth[which], max_branching)
+        _join(rng, trees, joint, together)
         _draw_avoid(rng, trees, max_avoid)
         return trees
 
@@ -181,6 +195,22 @@ def _grow(rng: np.random.Generator, trees: TaskTree, depth: Int[np.ndarray, " D"
     trees.reach[tasks, nodes, goal[tasks, nodes]] = True
 
 
+def _join(rng: np.random.Generator, trees: TaskTree, share: float, together: Bool[np.ndarray, "J P"] | None) -> None:
+    """Has a share of the edges reach a set that their proposition is part of, unless another edge near them does."""
+    if not share or together is None or not len(together):
+        return
+    reach, parent = np.asarray(trees.reach), np.asarray(trees.parent)
+    edge = trees.valid & (parent >= 0)
+    fits = (reach[:, :, None, :] & together).any(-1)
+    chosen = together[np.argmax(rng.random(fits.shape) * fits, axis=-1)]
+    joins = edge & fits.any(-1) & (rng.random(edge.shape) < share)
+    joined = np.where(joins[..., None], chosen, reach)
+    before = np.take_along_axis(joined, np.maximum(parent, 0)[:, :, None], axis=1)
+    siblings = (parent[:, :, None] == parent[:, None, :]) & edge[:, None, :] & ~np.eye(parent.shape[1], dtype=bool)
+    alike = siblings & (joined[:, :, None] == joined[:, None]).all(-1)
+    trees.reach[:] = np.where((alike.any(-1) | (joined == before).all(-1))[..., None], reach, joined)
+
+
 def _draw_avoid(rng: np.random.Generator, trees: TaskTree, max_avoid: int) -> None:
     """Fills the ``ensuring`` parts by the rules at the top."""
     num_tasks, num_nodes, num_propositions = trees.reach.shape
@@ -192,7 +222,7 @@ def _draw_avoid(rng: np.random.Generator, trees: TaskTree, max_avoid: int) -> No
     lottery = rng.random((num_tasks, num_nodes, num_propositions))
     lottery[reach | before] = 2.0
     rank = np.argsort(np.argsort(lottery, axis=-1), axis=-1)
-    trees.avoid[:] = rank < size[:, :, None]
+    trees.avoid[:] = (rank < size[:, :, None]) & ~(reach | before)
 
 
 def _until_good(

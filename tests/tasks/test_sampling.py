@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from typing import Any
 
 import jax
 import numpy as np
@@ -240,3 +241,39 @@ def test_sampled_trees_have_text() -> None:
         for m, expected in enumerate(task_hashes(batch)):
             text = tree_to_text(row(batch, m), NAMES)
             assert int(task_hash(compile_task(parse(text), NAMES, 20))) == int(expected)
+
+
+@pytest.mark.parametrize("joint", [0.3, 1.0])
+def test_goals_that_are_sets(joint: float) -> None:
+    """Every goal is a proposition or a set that holds together, and edges near one another still differ."""
+    together = np.array([[1, 1, 0, 0, 0], [1, 0, 1, 0, 0], [1, 1, 1, 0, 0]], bool)
+    known = {frozenset(np.flatnonzero(label).tolist()) for label in (*together, *np.eye(5, dtype=bool))}
+    how: dict[str, Any] = {"joint": joint, "together": together}
+    trees = sample_trees(np.random.default_rng(0), num_tasks=500, **TREES, **how)
+    counts = Counter[int]()
+    for m in range(500):
+        edges = np.flatnonzero(trees.valid[m] & (trees.parent[m] >= 0)).tolist()
+        goals = {0: frozenset[int]()} | {
+            node: frozenset(np.flatnonzero(trees.reach[m, node]).tolist()) for node in edges
+        }
+        assert set(goals.values()) - {frozenset()} <= known
+        assert all(goals[node] != goals[int(trees.parent[m, node])] for node in edges)
+        assert len({(int(trees.parent[m, node]), goals[node]) for node in edges}) == len(edges)
+        counts.update(len(goals[node]) for node in edges)
+    before = np.take_along_axis(trees.reach, np.maximum(trees.parent, 0)[..., None], axis=1)
+    assert not (trees.avoid & (trees.reach | before)).any()
+    # Two of five propositions are in no set; where all edges try, the rest fails for being like one nearby.
+    share = 1 - counts[1] / counts.total()
+    assert 0.65 * 0.6 * joint < share <= 0.62 * joint
+    sequences = sample_sequences(
+        np.random.default_rng(0), level=3, num_tasks=500, num_propositions=5, max_nodes=8, **how
+    )
+    assert 0.65 * 0.6 * joint < (sequences.reach[:, 1:4].sum(-1) > 1).mean() <= 0.62 * joint
+
+
+def test_no_set_to_reach() -> None:
+    """Without sets that hold together tasks are the same as ever."""
+    plain = sample_trees(np.random.default_rng(0), num_tasks=50, **TREES)
+    for together in (None, np.zeros((0, 5), bool)):
+        again = sample_trees(np.random.default_rng(0), num_tasks=50, **TREES, joint=0.5, together=together)
+        assert jax.tree.all(jax.tree.map(np.array_equal, plain, again))
