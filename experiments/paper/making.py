@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from experiments.paper.panels import Run
 from experiments.paper.records import Record, add_record, read_records, record_of
@@ -85,6 +86,19 @@ class Place:
     variables: Mapping[str, str] = dataclasses.field(default_factory=dict)
     cores: Sequence[int] = ()
 
+    def start(self, command: Sequence[str], **how: Any) -> subprocess.Popen[bytes]:
+        """Starts a process there.
+
+        Args:
+            command: its arguments.
+            **how: as for ``subprocess.Popen``.
+        """
+        process = subprocess.Popen(command, env=os.environ | self.variables, **how)
+        if sys.platform == "linux" and self.cores:
+            with contextlib.suppress(ProcessLookupError):  # it has failed already
+                os.sched_setaffinity(process.pid, self.cores)
+        return process
+
 
 def places(jobs: int | None) -> list[Place]:
     """An accelerator for each of the runs side by side, or else its share of the CPU cores."""
@@ -106,13 +120,7 @@ def _start(run: Run, work: Path, place: Place) -> subprocess.Popen[bytes]:
     work.mkdir(parents=True, exist_ok=True)
     with (work / f"{run.name}.log").open("ab") as log:
         # A process group of its own: Ctrl-C reaches this process alone, which then asks the others to stop.
-        process = subprocess.Popen(
-            command(run, work), stdout=log, stderr=log, env=os.environ | place.variables, start_new_session=True
-        )
-    if sys.platform == "linux" and place.cores:
-        with contextlib.suppress(ProcessLookupError):  # it has failed already
-            os.sched_setaffinity(process.pid, place.cores)
-    return process
+        return place.start(command(run, work), stdout=log, stderr=log, start_new_session=True)
 
 
 def _keep(run: Run, record: Record, records: Path) -> None:

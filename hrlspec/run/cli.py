@@ -20,9 +20,10 @@ COMMANDS = {
     "evaluate": "evaluate a trained agent on tasks of your own, or draw it",
     "demo": "the paper's two motivating examples, trained and drawn",
     "reproduce": "the paper's figures, in a checkout of the project",
+    "peers": "agents on formulas of others, beside published results, in a checkout",
     "suites": "draw the test suites anew, or check them",
 }
-_IN_CHECKOUT = ("reproduce",)
+_IN_CHECKOUT = ("reproduce", "peers")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

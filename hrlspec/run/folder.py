@@ -412,7 +412,7 @@ def _circumstances() -> dict[str, Any]:
     versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
     return {
         "versions": {"hrlspec": __version__, "python": platform.python_version(), **versions},
-        "commit": _commit(),
+        "commit": current_commit(),
         "command": sys.argv,
         "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPUs",
@@ -420,7 +420,7 @@ def _circumstances() -> dict[str, Any]:
     }
 
 
-def _commit() -> str | None:
+def current_commit() -> str | None:
     """The commit this code stands at, ``+changes`` if files differ from it; ``None`` where git does not know."""
     source = Path(__file__)
 

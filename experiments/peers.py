@@ -1,0 +1,86 @@
+"""``python -m experiments.peers``: our agents on the formulas of others, beside what others have published.
+
+Runs that have no record yet are made, or resumed where they were stopped; evaluations that are missing follow, and the
+page is written from the records alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+from experiments.paper.making import command, make
+from experiments.paper.panels import NUM_SEEDS
+from experiments.paper.records import read_records, record_of
+from experiments.published.comparisons import COMPARISONS
+from experiments.published.evaluations import Evaluation, evaluate, read_evaluations
+from experiments.published.report import page
+from hrlspec.run.cli import call
+from hrlspec.run.console import PlainConsole
+from hrlspec.run.errors import UserError
+from hrlspec.run.flags import parse_flags
+from hrlspec.run.signals import leave
+
+
+@dataclasses.dataclass(frozen=True)
+class PeersFlags:
+    """Runs and evaluates what the comparison with published results is made of, as far as it is missing."""
+
+    only: tuple[str, ...] = ()
+    """Worlds, such as letter12 or conveyor-simple-8; all if not given."""
+    seeds: int = NUM_SEEDS
+    """Runs of each world, seeds 0, 1, ..."""
+    jobs: int | None = None
+    """Processes side by side; one for each accelerator or CPU core if not given."""
+    out: Path | None = None
+    """Records and the page, peers.md; in the checkout results/peers if not given."""
+    work: Path | None = None
+    """Run folders with their checkpoints; runs in --out if not given, or without it runs/peers."""
+    dry_run: bool = False
+    """Only say what would be run."""
+
+
+def main(argv: Sequence[str], *, program: str = "hrlspec peers") -> None:
+    """The command line.
+
+    Args:
+        argv: the arguments.
+        program: what to call it in messages.
+
+    Raises:
+        UserError: bad usage, a run or an evaluation failed, or a damaged folder or file of records.
+        Interrupted: stopped by a signal; the runs have saved what they did.
+    """
+    flags = parse_flags(PeersFlags, argv, program=program)
+    for name in flags.only:
+        if name not in COMPARISONS:
+            raise UserError(f"--only {name}: there is no such world, expected some of: {', '.join(COMPARISONS)}")
+    for name, value in (("seeds", flags.seeds), ("jobs", flags.jobs)):
+        if value is not None and value < 1:
+            raise UserError(f"--{name} is {value}, expected at least 1")
+    out = flags.out or Path("results/peers")
+    work = flags.work or (flags.out / "runs" if flags.out else Path("runs/peers"))
+    console = PlainConsole(stderr=True)
+    asked = [comparison for name, comparison in COMPARISONS.items() if name in (flags.only or COMPARISONS)]
+    wanted = [Evaluation(run, suite) for some in asked for run in some.runs(flags.seeds) for suite in some.suites]
+    known = read_evaluations(wanted, out)
+    missing = [one for one in wanted if one not in known]
+    runs = list(dict.fromkeys(one.run for one in missing if record_of(work / one.run.name) is None))
+    console.say(f"{len(wanted)} evaluations, {len(missing)} of them missing, and {len(runs)} runs for them")
+    if flags.dry_run:
+        for run in runs:
+            print(" ".join(command(run, work)[1:]))
+        return
+    if runs:
+        make(runs, work=work, records=out, jobs=flags.jobs, console=console)
+    for done in evaluate(missing, work=work, folder=out, jobs=flags.jobs):
+        console.say(f"evaluated: {done.run.name} on {done.suite}")
+    every = [Evaluation(run, suite) for some in COMPARISONS.values() for run in some.runs() for suite in some.suites]
+    scores, records = read_evaluations(every, out), read_records({one.run for one in every}, out)
+    (out / "peers.md").write_text("\n".join(page(records, scores)) + "\n")
+    console.say(f"written: {out / 'peers.md'}")
+
+
+if __name__ == "__main__":
+    leave(call("peers", program="python -m experiments.peers"))
