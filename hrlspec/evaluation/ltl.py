@@ -27,6 +27,7 @@ from hrlspec.tasks.rewards import RewardMachine
 
 MAX_NODES = 64
 """Default for the trees that the states of automata show: of larger ones the longest paths are left out."""
+_LEAST_ROWS = 32
 EPISODES = 512
 """Of each formula, as the peers have it."""
 
@@ -190,6 +191,8 @@ def suite_of_automata(
     """
     together, cut, silent = automata_of(automata, env.propositions, max_nodes)
     num_states = np.array([automaton.num_states for automaton in automata])
+    # One compiled program for all suites of up to so many states, and others for twice and four times as many.
+    together = together.padded(max(_LEAST_ROWS, 1 << int(num_states.sum() - 1).bit_length()))
     return LtlSuite(name, automata[0].marks is not None, tuple(formulas), together, num_states, cut, silent)
 
 

@@ -52,6 +52,16 @@ class Automata:
         """See `advance`."""
         return advance(self.successors, self.accepts, self.column, row, labels)
 
+    def padded(self, num_rows: int) -> Automata:
+        """The same with ``num_rows`` rows, numpy leaves: copies of the last one are added, which nothing leads to."""
+        missing = num_rows - len(self.status)
+
+        def pad(x: Array) -> np.ndarray:
+            return np.pad(x, [(0, missing)] + [(0, 0)] * (x.ndim - 1), mode="edge")
+
+        rows = {name: getattr(self, name) for name in ("trees", "successors", "status", "accepts")}
+        return Automata(**jax.tree.map(pad, rows), column=self.column, start=self.start)
+
 
 def advance(
     successors: Int32[Array, "R L"],

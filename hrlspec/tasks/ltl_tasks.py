@@ -11,7 +11,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jaxtyping import Bool, Int32
 
@@ -85,13 +84,8 @@ class LtlTasks:
         Raises:
             SpecError: if the text is no formula, names unknown propositions or needs more than S states.
         """
-        automaton, table = _read(text, self)
-        missing = self.max_states - automaton.num_states
-        padded: dict[str, Any] = {
-            name: np.pad(getattr(table, name), [(0, missing)] + [(0, 0)] * (getattr(table, name).ndim - 1))
-            for name in ("successors", "status", "accepts")
-        }
-        return LtlTask(**padded, column=table.column)
+        table = _read(text, self)[1].padded(self.max_states)
+        return LtlTask(table.successors, table.status, table.accepts, table.column)
 
     def start(self, task: LtlTask) -> LtlProgress:
         """In the initial state; the labels of the first observation do not count."""

@@ -11,7 +11,7 @@ import pytest
 
 import envs_jax
 from hrlspec.evaluation import evaluate_ltl, ltl_suite, run_episodes
-from hrlspec.evaluation.episodes import trace_episodes
+from hrlspec.evaluation.episodes import _run, trace_episodes
 from hrlspec.presets.peers import go_on_for_ever, peer_formulas, peer_suites
 from hrlspec.spec import compile_task, parse
 from hrlspec.spec.automata import Automata, automata_of
@@ -128,6 +128,17 @@ def test_a_suite_of_formulas() -> None:
     json.dumps(found.to_json(), allow_nan=False)
     again = evaluate_ltl(KEY, WALKER, manner(), COMPLETION, suite, episodes=40, greedy=True, chunk=7)
     assert [score.success_rate for score in again.per_formula] == [score.success_rate for score in found.per_formula]
+
+
+def test_another_formula_needs_no_compilation() -> None:
+    """Whatever the number of its automaton's states."""
+    suites = [ltl_suite("some", text, LETTER) for text in ("F a", "F (a & F (b & F (c & F (d & F e))))", "!a U b")]
+    assert len({int(suite.num_states[0]) for suite in suites}) == 3
+    sizes = []
+    for suite in suites:
+        evaluate_ltl(KEY, WALKER, manner(), COMPLETION, suite, episodes=3)
+        sizes.append(_run._cache_size())
+    assert sizes[0] == sizes[1] == sizes[2]
 
 
 @pytest.mark.parametrize("name", peer_suites())
