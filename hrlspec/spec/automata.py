@@ -21,7 +21,7 @@ from envs_jax.arrays import Array
 from hrlspec.spec.ltl.automaton import Automaton
 from hrlspec.spec.monitor import RUNNING, SATISFIED, VIOLATED
 from hrlspec.spec.tree import TaskTree
-from hrlspec.spec.unfold import unfold
+from hrlspec.spec.unfold import Unfolded, unfold
 
 MAX_PROPOSITIONS = 16
 """Most propositions of an environment: labels are looked up in a table of all sets of them."""
@@ -89,7 +89,11 @@ def advance(
 
 
 def automata_of(
-    automata: Sequence[Automaton], propositions: Sequence[str], max_nodes: int
+    automata: Sequence[Automaton],
+    propositions: Sequence[str],
+    max_nodes: int,
+    *,
+    trees: Sequence[TaskTree] | None = None,
 ) -> tuple[Automata, Bool[np.ndarray, " M"], Bool[np.ndarray, " M"]]:
     """Puts automata together for acting.
 
@@ -97,6 +101,8 @@ def automata_of(
         automata: M of them, over the same labels in the same order.
         propositions: names of the P propositions, in the order of an environment's labels.
         max_nodes: N, padded size of the trees.
+        trees: what is shown in the states of each, leading axis Q, if not what `unfold` makes of them: see
+            `hrlspec.spec.readings.monitor_automaton`.
 
     Returns:
         The automata; and, bool ``[M]``, of which some tree was cut, and in which a way on begins where nothing holds.
@@ -109,7 +115,10 @@ def automata_of(
     labels = automata[0].labels
     if any(automaton.labels != labels for automaton in automata):
         raise ValueError("the automata are over different labels")
-    unfolded = [unfold(automaton, propositions, max_nodes) for automaton in automata]
+    if trees is None:
+        unfolded = [unfold(automaton, propositions, max_nodes) for automaton in automata]
+    else:
+        unfolded = [Unfolded(shown, np.zeros(1, bool), np.zeros(1, bool)) for shown in trees]
     sizes = np.array([automaton.num_states for automaton in automata])
     start = np.concatenate([[0], np.cumsum(sizes)[:-1]])
     status = np.full(sizes.sum(), RUNNING, np.int32)

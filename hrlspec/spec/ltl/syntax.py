@@ -97,12 +97,14 @@ def is_keyword(word: str) -> bool:
 
 
 def subformulas(formula: Formula) -> Iterator[Formula]:
-    """The formula and all below it, those that occur several times as often, parents first."""
-    stack = [formula]
+    """The formula and all below it, parents first; a node that several others share comes once."""
+    stack, seen = [formula], {id(formula)}
     while stack:
         node = stack.pop()
         yield node
-        stack.extend(reversed(node.children))
+        fresh = {id(child): child for child in node.children if id(child) not in seen}
+        seen |= fresh.keys()
+        stack.extend(reversed(fresh.values()))
 
 
 def propositions_of(formula: Formula) -> tuple[str, ...]:
