@@ -6,7 +6,7 @@ from hrlspec.evaluation.aggregate import Aggregate, aggregate
 from hrlspec.evaluation.cases import BranchCases, Cases, make_branch_cases, make_cases
 from hrlspec.evaluation.episodes import Episodes, run_episodes
 from hrlspec.evaluation.first_choice import FirstChoiceEvaluation, FirstChoiceResult, first_choice_evaluation
-from hrlspec.evaluation.ltl import FormulaScore, LtlResult, LtlSuite, evaluate_ltl, ltl_suite
+from hrlspec.evaluation.ltl import FormulaScore, LtlResult, LtlSuite, evaluate_ltl, exact_suite, ltl_suite
 from hrlspec.evaluation.protocol import (
     ChoiceEvaluation,
     ReturnEvaluation,
@@ -43,6 +43,7 @@ __all__ = [
     "choice_evaluation",
     "evaluate_ltl",
     "evaluate_suite",
+    "exact_suite",
     "final_evaluation",
     "first_choice_evaluation",
     "ltl_suite",

@@ -1,4 +1,4 @@
-"""Evaluating an agent on tasks in linear temporal logic, which it carries out as automata.
+"""Evaluating an agent on tasks that it carries out as automata: formulas in linear temporal logic, and others.
 
 Axes: **M** formulas, **B** episodes.
 """
@@ -6,7 +6,7 @@ Axes: **M** formulas, **B** episodes.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -20,9 +20,10 @@ from hrlspec.agent.low_level import Params
 from hrlspec.evaluation.episodes import Episodes, run_episodes
 from hrlspec.evaluation.results import interval_to_json
 from hrlspec.evaluation.stats import Interval, mean_interval, rate_interval
-from hrlspec.spec import SpecError, bare_lines
+from hrlspec.spec import SpecError, bare_lines, parse
 from hrlspec.spec.automata import MAX_PROPOSITIONS, Automata, automata_of
 from hrlspec.spec.ltl import Automaton, parse_ltl, to_automaton, to_buchi
+from hrlspec.spec.readings import exact_automaton
 from hrlspec.tasks.rewards import RewardMachine
 
 MAX_NODES = 64
@@ -41,7 +42,7 @@ class LtlSuite:
         forever: whether the tasks go on for ever.
         formulas: their text.
         automata: the tasks for acting.
-        num_states: int ``[M]``, of each automaton.
+        sources: the same, one by one.
         cut: bool ``[M]``, some state has more paths to acceptance than its tree shows.
         silent: bool ``[M]``, some way on begins where nothing holds, which no sub-task can ask for.
     """
@@ -50,13 +51,18 @@ class LtlSuite:
     forever: bool
     formulas: tuple[str, ...]
     automata: Automata
-    num_states: Int[np.ndarray, " M"]
+    sources: tuple[Automaton, ...]
     cut: Bool[np.ndarray, " M"]
     silent: Bool[np.ndarray, " M"]
 
     def __len__(self) -> int:
         """M."""
         return len(self.formulas)
+
+    @property
+    def num_states(self) -> Int[np.ndarray, " M"]:
+        """Of each automaton."""
+        return np.array([automaton.num_states for automaton in self.sources])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,22 +165,61 @@ def ltl_suite(name: str, text: str, env: Environment, *, forever: bool = False, 
     Raises:
         SpecError: with the line and column of the first mistake, if an automaton is too large, or without a formula.
     """
-    if env.num_propositions > MAX_PROPOSITIONS:
-        found = f"{env.name} has {env.num_propositions} propositions"
-        raise SpecError(f"{found}, formulas in LTL take {MAX_PROPOSITIONS} at most", source=name)
     translate = to_buchi if forever else to_automaton
+
+    def read(line: str) -> Automaton:
+        return translate(parse_ltl(line), env.propositions, env.possible_labels)
+
+    return _suite(name, text, env, read, max_nodes)
+
+
+def exact_suite(name: str, text: str, env: Environment, *, max_nodes: int = MAX_NODES) -> LtlSuite:
+    """Reads tasks in SPECTRL, to be carried out in their exact reading; see `ltl_suite`.
+
+    What a tree cannot say is read, too, such as ``achieve a ensuring b``.
+
+    Args:
+        name: of the suite, and of the text in errors.
+        text: one task a line; ``#`` begins a comment, blank lines are skipped.
+        env: whose propositions they are about, and whose labels their automata read.
+        max_nodes: N, padded size of the trees that the states show.
+
+    Raises:
+        SpecError: with the line and column of the first mistake, if an automaton is too large, or without a task.
+    """
+
+    def read(line: str) -> Automaton:
+        return exact_automaton(parse(line), env.propositions, env.possible_labels)
+
+    return _suite(name, text, env, read, max_nodes)
+
+
+def _suite(name: str, text: str, env: Environment, read: Callable[[str], Automaton], max_nodes: int) -> LtlSuite:
+    """A suite of one task a line."""
+    check_propositions(name, env)
     formulas, automata = [], []
     for number, line in enumerate(bare_lines(text), 1):
         if not line.strip():
             continue
         try:
-            automata.append(translate(parse_ltl(line), env.propositions, env.possible_labels))
+            automata.append(read(line))
         except SpecError as error:
             raise SpecError(error.message, number, error.column or 1, name) from None
         formulas.append(" ".join(line.split()))
     if not formulas:
         raise SpecError("found no formula, expected one on each line", source=name)
     return suite_of_automata(name, formulas, automata, env, max_nodes=max_nodes)
+
+
+def check_propositions(name: str, env: Environment) -> None:
+    """Whether an environment's tasks can be automata.
+
+    Raises:
+        SpecError: in the name of a suite; it has more than `MAX_PROPOSITIONS`.
+    """
+    if env.num_propositions > MAX_PROPOSITIONS:
+        found = f"{env.name} has {env.num_propositions} propositions"
+        raise SpecError(f"{found}, tasks as automata take {MAX_PROPOSITIONS} at most", source=name)
 
 
 def suite_of_automata(
@@ -190,10 +235,10 @@ def suite_of_automata(
         max_nodes: N, padded size of the trees that the states show.
     """
     together, cut, silent = automata_of(automata, env.propositions, max_nodes)
-    num_states = np.array([automaton.num_states for automaton in automata])
     # One compiled program for all suites of up to so many states, and others for twice and four times as many.
-    together = together.padded(max(_LEAST_ROWS, 1 << int(num_states.sum() - 1).bit_length()))
-    return LtlSuite(name, automata[0].marks is not None, tuple(formulas), together, num_states, cut, silent)
+    num_states = sum(automaton.num_states for automaton in automata)
+    together = together.padded(max(_LEAST_ROWS, 1 << (num_states - 1).bit_length()))
+    return LtlSuite(name, automata[0].marks is not None, tuple(formulas), together, tuple(automata), cut, silent)
 
 
 def evaluate_ltl(
@@ -252,7 +297,7 @@ def _scores(suite: LtlSuite, which: Int[np.ndarray, " B"], episodes: Episodes) -
     return tuple(
         FormulaScore(
             formula=formula,
-            num_states=int(suite.num_states[number]),
+            num_states=suite.sources[number].num_states,
             cut=bool(suite.cut[number]),
             silent=bool(suite.silent[number]),
             success_rate=rate_interval(success[mine]),

@@ -1,4 +1,4 @@
-"""Pictures of runs: learning curves, example trajectories, task graphs, one animation.
+"""Pictures of runs: learning curves, example trajectories, task graphs, automata, one animation.
 
 Axes: **B** episodes, **H** horizon.
 """
@@ -28,6 +28,8 @@ from hrlspec.evaluation.cases import draw_layouts
 from hrlspec.evaluation.episodes import Episodes, Trace, trace_episodes
 from hrlspec.run.timeline import Timeline
 from hrlspec.spec import RUNNING, SATISFIED, VIOLATED, TaskState, TaskTree, draw_task, subtasks
+from hrlspec.spec.draw_automaton import draw_automaton
+from hrlspec.spec.ltl import Automaton
 from hrlspec.tasks.rewards import RewardMachine
 
 _FRAME_MS, _LAST_FRAME_MS = 350, 1500
@@ -216,9 +218,7 @@ def gallery(episodes: Sequence[Episode], names: Sequence[str], file: Path) -> Pa
         title = "\n".join(textwrap.wrap(episode.formula, 60))
         ax.set_title(f"{title}\n{episode.outcome}, {len(episode.assigned)} steps", fontsize=9)
         ax.legend(loc="upper right", fontsize=7)
-    with rc_context({"svg.hashsalt": file.stem}):
-        figure.savefig(file, dpi=110, metadata={"Date": None} if file.suffix == ".svg" else {"Software": None})
-    return file
+    return _save(figure, file)
 
 
 def task_graph(episode: Episode, names: Sequence[str], file: Path) -> Path:
@@ -227,6 +227,20 @@ def task_graph(episode: Episode, names: Sequence[str], file: Path) -> Path:
     blocked = np.zeros(episode.tree.num_nodes, bool)
     state = TaskState(node=episode.nodes[-1], blocked=blocked, status=np.int32(status))  # type: ignore[arg-type]
     draw_task(episode.tree, names, state).savefig(file, dpi=110, metadata={"Software": None})
+    return file
+
+
+def automaton_graph(automaton: Automaton, task: str, file: Path) -> Path:
+    """Draws an automaton below its task; the file's ending says in which format."""
+    figure = draw_automaton(automaton)
+    figure.suptitle("\n".join(textwrap.wrap(task, 80)), fontsize=9)
+    return _save(figure, file)
+
+
+def _save(figure: Figure, file: Path) -> Path:
+    """The same bytes for the same picture, as PNG or SVG."""
+    with rc_context({"svg.hashsalt": file.stem}):
+        figure.savefig(file, dpi=110, metadata={"Date": None} if file.suffix == ".svg" else {"Software": None})
     return file
 
 

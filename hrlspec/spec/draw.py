@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import jax
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_IDLE, _TAKEN, _HERE, _DONE, _FAILED, _BLOCKED = "#d9dde3", "#2f6fb2", "#f2b134", "#4f9d5d", "#c8443c", "#b0b0b0"
+IDLE, TAKEN, HERE, DONE, FAILED, BLOCKED = "#d9dde3", "#2f6fb2", "#f2b134", "#4f9d5d", "#c8443c", "#b0b0b0"
 
 
 def draw_task(
@@ -41,11 +42,7 @@ def draw_task(
         ImportError: without networkx and matplotlib, saying how to install them.
         ValueError: if the number of names is not P.
     """
-    try:
-        import networkx
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError("drawing tasks needs networkx and matplotlib: pip install 'hrlspec[plot]'") from error
+    networkx = networkx_for_drawing()
     tree = jax.tree.map(np.asarray, tree)
     graph = networkx.DiGraph()
     nodes = np.flatnonzero(tree.valid).tolist()
@@ -57,6 +54,8 @@ def draw_task(
             labels[node, child] = "∧".join(reach) + "".join(f"\n¬{name}" for name in avoid)
     places = _places(tree, nodes)
     if ax is None:
+        from matplotlib.figure import Figure
+
         width = max(4.0, 1.5 * sum(bool(tree.accepting[node]) for node in nodes))
         ax = Figure(figsize=(width, 2.0 + 1.3 * int(tree.depth.max())), layout="constrained").subplots()
     node_colors, edge_colors, styles = _paint(tree, state, nodes, list(graph.edges))
@@ -68,7 +67,7 @@ def draw_task(
         graph, places, nodelist=nodes, node_size=430, node_color=node_colors, edgecolors="#222222", ax=ax
     )
     networkx.draw_networkx_labels(graph, places, {node: str(node) for node in nodes}, font_size=8, ax=ax)
-    widths = [2.6 if color == _TAKEN else 1.2 for color in edge_colors]
+    widths = [2.6 if color == TAKEN else 1.2 for color in edge_colors]
     networkx.draw_networkx_edges(
         graph, places, edge_color=edge_colors, style=styles, width=widths, node_size=620, ax=ax
     )
@@ -78,6 +77,20 @@ def draw_task(
     figure = ax.get_figure(root=True)
     assert figure is not None
     return figure
+
+
+def networkx_for_drawing() -> ModuleType:
+    """The library of graphs, where all that draws is there.
+
+    Raises:
+        ImportError: it is not; the message says what to install.
+    """
+    try:
+        import matplotlib.figure  # noqa: F401
+        import networkx
+    except ImportError as error:
+        raise ImportError("drawing tasks needs networkx and matplotlib: pip install 'hrlspec[plot]'") from error
+    return networkx
 
 
 def _places(tree: TaskTree, nodes: list[int]) -> dict[int, tuple[float, float]]:
@@ -107,17 +120,16 @@ def _paint(
 ) -> tuple[list[str], list[str], list[str]]:
     """Colours of the nodes and of the edges, and line styles of the edges."""
     if state is None:
-        return [_IDLE] * len(nodes), ["#444444"] * len(edges), ["solid"] * len(edges)
+        return [IDLE] * len(nodes), ["#444444"] * len(edges), ["solid"] * len(edges)
     current, status = int(state.node), int(state.status)
     blocked = np.asarray(state.blocked)
     path = [current]
     while tree.parent[path[-1]] >= 0:
         path.append(int(tree.parent[path[-1]]))
-    here = {SATISFIED: _DONE, VIOLATED: _FAILED}.get(status, _HERE)
-    node_colors = [here if node == current else _TAKEN if node in path else _IDLE for node in nodes]
+    here = {SATISFIED: DONE, VIOLATED: FAILED}.get(status, HERE)
+    node_colors = [here if node == current else TAKEN if node in path else IDLE for node in nodes]
     shut = [parent == current and (bool(blocked[child]) or status == VIOLATED) for parent, child in edges]
     edge_colors = [
-        _TAKEN if child in path else _BLOCKED if gone else "#444444"
-        for (_, child), gone in zip(edges, shut, strict=True)
+        TAKEN if child in path else BLOCKED if gone else "#444444" for (_, child), gone in zip(edges, shut, strict=True)
     ]
     return node_colors, edge_colors, ["dashed" if gone else "solid" for gone in shut]

@@ -109,7 +109,7 @@ def monitor_automaton(
     labels = tuple(dict.fromkeys(map(frozenset, possible_labels)))
     holds = np.array([[name in label for name in propositions] for label in labels])
     start: TaskState = jax.device_get(initial(tree))
-    states = [start, dataclasses.replace(start, status=SATISFIED)]
+    states = [start, dataclasses.replace(start, status=np.int32(SATISFIED))]  # type: ignore[arg-type]
     numbers = {_key(state): number for number, state in enumerate(states)}
     rows = [[0] * len(labels), [1] * len(labels)]
     for number, state in enumerate(states):  # grows while it is read

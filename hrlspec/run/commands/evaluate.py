@@ -9,22 +9,33 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
 
+from envs_jax import Environment
 from hrlspec import checkpoint
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.low_level import Params
 from hrlspec.api import TrainedAgent, evaluate
 from hrlspec.config import Checked, setting
-from hrlspec.evaluation import LtlResult, LtlSuite, Suite, SuiteResult, evaluate_ltl, ltl_suite, suite_from_text
+from hrlspec.evaluation import (
+    LtlResult,
+    LtlSuite,
+    Suite,
+    SuiteResult,
+    evaluate_ltl,
+    exact_suite,
+    ltl_suite,
+    suite_from_text,
+)
 from hrlspec.evaluation.ltl import MAX_NODES as LTL_NODES
-from hrlspec.evaluation.ltl import suite_of_automata
+from hrlspec.evaluation.ltl import check_propositions, suite_of_automata
 from hrlspec.evaluation.suite import MAX_NODES
 from hrlspec.presets.peers import go_on_for_ever, peer_formulas
 from hrlspec.run import platform
+from hrlspec.run.automaton_file import check_automaton, check_automaton_file, write_automaton
 from hrlspec.run.console import result_console
 from hrlspec.run.errors import UserError
 from hrlspec.run.experiment import Experiment, experiment_of
@@ -34,10 +45,13 @@ from hrlspec.run.folder import check_writable, read_record
 from hrlspec.run.tables import ltl_table, suite_table
 from hrlspec.run.unseen import with_tasks
 from hrlspec.spec import SpecError, bare_lines
+from hrlspec.spec.dfa import from_json
 from hrlspec.spec.hoa import from_hoa, until_accepting
+from hrlspec.spec.ltl import Automaton
+from hrlspec.spec.readings import committed_automaton
 
 MOST_PICTURES = 9
-_TASKS = ("spec", "spec_file", "ltl", "ltl_file", "hoa", "suite")
+_TASKS = ("spec", "spec_file", "ltl", "ltl_file", "hoa", "dfa", "suite")
 _LARGEST_FILE = 1_000_000  # bytes
 
 
@@ -45,7 +59,7 @@ _LARGEST_FILE = 1_000_000  # bytes
 class EvaluateFlags(Checked):
     """Reports success, return, steps and SPL of a trained agent on the given tasks, in layouts drawn at random.
 
-    Exactly one of --spec, --spec-file, --ltl, --ltl-file, --hoa and --suite says which tasks.
+    Exactly one of --spec, --spec-file, --ltl, --ltl-file, --hoa, --dfa and --suite says which tasks.
     """
 
     run: Path
@@ -54,19 +68,23 @@ class EvaluateFlags(Checked):
     """A task in SPECTRL, such as "achieve a; (achieve b ensuring not c)"."""
     spec_file: Path | None = None
     """A file with one task a line; # begins a comment."""
+    semantics: Literal["committed", "exact"] = "committed"
+    """How tasks in SPECTRL are read: by the first visits, as they are trained, or so that a second try is allowed."""
     ltl: str | None = None
     """A task in linear temporal logic, such as "F (a & (!b U c))", to be satisfied by the end of the episode."""
     ltl_file: Path | None = None
     """A file with one such formula a line."""
     hoa: Path | None = None
     """A file with an automaton in the Hanoi Omega-Automata format, deterministic Büchi."""
+    dfa: Path | None = None
+    """A file with an automaton as the library dfa has it: json.dumps(dfa2dict(...))."""
     forever: bool = False
     """Count how often a formula's accepting transitions are taken, instead of asking whether it is satisfied in the
     end. Published suites know it of themselves."""
     suite: str | None = None
     """A suite of the run's environment, such as dag, or published formulas, such as jaxolotl/letter_finite."""
     episodes: int = setting(500, least=1, most=1_000_000)
-    """In all; at least one for each task. For formulas in LTL, of each."""
+    """In all; at least one for each task. For tasks as automata, of each."""
     seed: int = setting(0, least=0, most=2**31 - 1)
     """Of layouts and actions."""
     step: int | None = None
@@ -76,9 +94,12 @@ class EvaluateFlags(Checked):
     shield: bool = False
     """Replace actions that would step on forbidden propositions."""
     max_nodes: int = setting(MAX_NODES, least=2, most=4096)
-    """Largest task tree. Trees of formulas in LTL are cut at 64 nodes, or fewer."""
+    """Largest task tree. Trees of automata are cut at 64 nodes, or fewer."""
     draw: Path | None = None
     """A picture (.png or .svg) of one episode of each task, of the first nine."""
+    automaton: Path | None = None
+    """The automaton of the one task, with short guards as a picture (.png or .svg) or for Graphviz (.dot), or to be
+    read again: .hoa for --hoa, .json for --dfa."""
     json: bool = False
     """Print one JSON object and nothing else on standard output."""
 
@@ -98,37 +119,29 @@ def main(argv: Sequence[str], *, program: str = "hrlspec evaluate") -> None:
     flags = parse_flags(EvaluateFlags, argv, program=program)
     _check(flags)
     experiment = experiment_of(read_record(flags.run)["config"], str(flags.run))
-    formulas = formulas_of(flags, experiment)
-    if formulas is not None and flags.draw is not None:
-        raise UserError("--draw takes tasks in SPECTRL, no formulas and no automata")
-    suite = None if formulas else tasks_of(flags, experiment)
+    tasks = formulas_of(flags, experiment) or tasks_of(flags, experiment)
+    if flags.draw is not None and isinstance(tasks, LtlSuite):
+        raise UserError("--draw takes tasks in SPECTRL, no formulas and no automata; --automaton draws one of these")
     platform.prepare()
+    automaton = None if flags.automaton is None else _automaton_of(flags.automaton, tasks, experiment)
     agent = experiment.agent
     params, step = load_params(agent, flags.run, flags.step)
     facts = {"run": str(flags.run), "checkpoint_step": step, "reward_set": experiment.reward_set}
     key = jax.random.fold_in(jax.random.key(flags.seed), 1)
-    if formulas is not None:
-        how: dict[str, Any] = {"seed": flags.seed, "greedy": flags.greedy, "shield": flags.shield}
-        found = evaluate_ltl(key, agent, params, experiment.rewards, formulas, episodes=flags.episodes, **how)
-        _show(flags, found, facts)
-        return
-    assert suite is not None
-    try:
-        result = evaluate(
-            key,
-            TrainedAgent(agent, params, experiment.rewards),
-            suite,
-            episodes=flags.episodes,
-            seed=flags.seed,
-            greedy=flags.greedy,
-            shield=flags.shield,
-        )
-    except ValueError as error:
-        raise UserError(str(error)) from error  # a task that nothing can satisfy
-    _show(flags, result, facts)
-    if flags.draw is not None:
-        with drawing():
-            _draw(flags, agent, params, experiment, suite)
+    how: dict[str, Any] = {name: getattr(flags, name) for name in ("episodes", "seed", "greedy", "shield")}
+    if isinstance(tasks, LtlSuite):
+        _show(flags, evaluate_ltl(key, agent, params, experiment.rewards, tasks, **how), facts)
+    else:
+        try:
+            result = evaluate(key, TrainedAgent(agent, params, experiment.rewards), tasks, **how)
+        except ValueError as error:
+            raise UserError(str(error)) from error  # a task that nothing can satisfy
+        _show(flags, result, facts)
+        if flags.draw is not None:
+            with drawing():
+                _draw(flags, agent, params, experiment, tasks)
+    if automaton is not None and flags.automaton is not None:
+        write_automaton(automaton, tasks.formulas[0], flags.automaton)
 
 
 def _show(flags: EvaluateFlags, result: SuiteResult | LtlResult, facts: dict[str, Any]) -> None:
@@ -169,36 +182,63 @@ def load_params(agent: Agent, run: Path, step: int | None = None) -> tuple[Param
     return restored.state["params"], restored.step
 
 
+def _automaton_of(file: Path, tasks: Suite | LtlSuite, experiment: Experiment) -> Automaton:
+    """The automaton of the one task.
+
+    Raises:
+        UserError: there are several tasks, or the file cannot hold the automaton.
+        SpecError: it is too large, or the environment has too many propositions.
+    """
+    if len(tasks) != 1:
+        raise UserError(f"--automaton takes one task, found {len(tasks)}")
+    if isinstance(tasks, LtlSuite):
+        (automaton,) = tasks.sources
+    else:
+        env = experiment.preset.make()
+        check_propositions(tasks.name, env)
+        tree = jax.tree.map(lambda x: x[0], tasks.trees)
+        automaton = committed_automaton(tree, env.propositions, env.possible_labels)
+    check_automaton("--automaton", file, automaton)
+    return automaton
+
+
 def formulas_of(flags: EvaluateFlags, experiment: Experiment) -> LtlSuite | None:
-    """The formulas in LTL that the flags name; ``None`` if they name tasks in SPECTRL.
+    """The tasks that are carried out as automata; ``None`` if the flags name tasks that are trees.
 
     Raises:
         UserError: no such file.
         SuiteError: no such suite.
-        SpecError: a formula cannot be read, or its automaton is too large.
+        SpecError: a task cannot be read, or its automaton is too large.
     """
+    env, max_nodes = experiment.preset.make(), min(flags.max_nodes, LTL_NODES)
+    if flags.hoa is not None:
+        return _of_automaton(flags.hoa, flags, env)
+    if flags.dfa is not None:
+        return _of_automaton(flags.dfa, flags, env)
+    if flags.semantics == "exact":
+        name, text = _spectrl(flags)
+        return exact_suite(name, text, env, max_nodes=max_nodes)
     if flags.ltl is not None:
         name, text, forever = "--ltl", " ".join(bare_lines(flags.ltl)), flags.forever
     elif flags.ltl_file is not None:
         name, text, forever = flags.ltl_file.name, _read(flags.ltl_file), flags.forever
-    elif flags.hoa is not None:
-        return _of_automaton(flags.hoa, flags, experiment)
     elif flags.suite is not None and "/" in flags.suite:
         name, text, forever = flags.suite, peer_formulas(flags.suite), go_on_for_ever(flags.suite)
     else:
         return None
-    env, max_nodes = experiment.preset.make(), min(flags.max_nodes, LTL_NODES)
     return ltl_suite(name, text, env, forever=forever, max_nodes=max_nodes)
 
 
-def _of_automaton(file: Path, flags: EvaluateFlags, experiment: Experiment) -> LtlSuite:
-    """A suite of the one task in a HOA file."""
-    env = experiment.preset.make()
+def _of_automaton(file: Path, flags: EvaluateFlags, env: Environment) -> LtlSuite:
+    """A suite of the one task in a file of --hoa or --dfa."""
+    check_propositions(file.name, env)
+    read = from_hoa if flags.dfa is None else from_json
     try:
-        automaton = from_hoa(_read(file), env.propositions, env.possible_labels)
+        automaton = read(_read(file), env.propositions, env.possible_labels)
     except SpecError as error:
         raise SpecError(error.message, error.line, error.column, file.name) from None
-    automaton = automaton if flags.forever else until_accepting(automaton)
+    if automaton.marks is not None and not flags.forever:
+        automaton = until_accepting(automaton)
     return suite_of_automata(file.name, [file.name], [automaton], env, max_nodes=min(flags.max_nodes, LTL_NODES))
 
 
@@ -211,13 +251,17 @@ def tasks_of(flags: EvaluateFlags, experiment: Experiment) -> Suite:
     """
     if flags.suite is not None:
         return with_tasks(experiment.preset, flags.run, experiment.seed).suite(flags.suite)
+    name, text = _spectrl(flags)
+    return suite_from_text(name, text, experiment.preset.make().propositions, max_nodes=flags.max_nodes)
+
+
+def _spectrl(flags: EvaluateFlags) -> tuple[str, str]:
+    """The name and the lines of --spec or --spec-file."""
     if flags.spec is not None:
         # A task may be written over several lines; a suite has one on each.
-        name, text = "--spec", " ".join(bare_lines(flags.spec))
-    else:
-        assert flags.spec_file is not None
-        name, text = flags.spec_file.name, _read(flags.spec_file)
-    return suite_from_text(name, text, experiment.preset.make().propositions, max_nodes=flags.max_nodes)
+        return "--spec", " ".join(bare_lines(flags.spec))
+    assert flags.spec_file is not None
+    return flags.spec_file.name, _read(flags.spec_file)
 
 
 def _read(file: Path) -> str:
@@ -239,6 +283,10 @@ def _check(flags: EvaluateFlags) -> None:
         raise UserError(f"expected exactly one of {flags_there_are} and --suite, found {found}")
     if flags.forever and flags.ltl is None and flags.ltl_file is None and flags.hoa is None:
         raise UserError("--forever goes with --ltl, --ltl-file or --hoa")
+    if flags.semantics != "committed" and flags.spec is None and flags.spec_file is None:
+        raise UserError(f"--semantics {flags.semantics} goes with --spec or --spec-file")
+    if flags.automaton is not None:
+        check_automaton_file("--automaton", flags.automaton)
     if flags.draw is not None and flags.draw.suffix not in (".png", ".svg"):
         raise UserError(f"--draw {flags.draw}: expected a file that ends in .png or .svg")
     if flags.draw is not None:

@@ -1,0 +1,104 @@
+"""The transitions of an automaton with short guards, for people to read: ``a & !b`` in place of eight labels.
+
+A guard says no more than what must hold for the labels that can occur: labels that cannot occur are told apart from
+nothing. It is a disjunction of as few conjunctions as there can be, and of those with the fewest literals.
+
+Sets of propositions are integers here, bit i standing for the i-th name in alphabetical order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import Bounds, LinearConstraint, milp
+
+from hrlspec.spec.ltl.automaton import Automaton
+
+
+class Transition(NamedTuple):
+    """All labels that lead from one state to another, or to the same.
+
+    Attributes:
+        source: the state before.
+        target: the state after.
+        accepting: a round of a task that goes on for ever is complete.
+        guard: which labels, in the syntax of LTL; ``true`` for all that can occur.
+    """
+
+    source: int
+    target: int
+    accepting: bool
+    guard: str
+
+
+class _Cube(NamedTuple):
+    """A conjunction of literals: on the propositions that it names the label is this."""
+
+    named: int
+    holding: int
+
+
+def transitions(automaton: Automaton) -> list[Transition]:
+    """State by state; accepting transitions apart from others between the same states."""
+    names = sorted(frozenset().union(*automaton.labels))
+    codes = [sum(1 << names.index(name) for name in label) for label in automaton.labels]
+    marks = np.zeros_like(automaton.successors) if automaton.marks is None else automaton.marks
+    known: dict[tuple[frozenset[int], frozenset[int]], str] = {}  # states have many guards in common
+    found = []
+    for state in range(automaton.num_states):
+        goes = {
+            code: (int(target), bool(marked))
+            for code, target, marked in zip(codes, automaton.successors[state], marks[state], strict=True)
+        }
+        for bit in (1 << i for i in range(len(names))):
+            if all(goes.get(code ^ bit) == where for code, where in goes.items()):  # it makes no difference
+                goes = {code: where for code, where in goes.items() if not code & bit}
+        for target, accepting in dict.fromkeys(goes.values()):
+            on = frozenset(code for code, where in goes.items() if where == (target, accepting))
+            off = frozenset(goes) - on
+            if (on, off) not in known:
+                known[on, off] = _text(_cover(on, off), names)
+            found.append(Transition(state, target, accepting, known[on, off]))
+    return found
+
+
+def _text(cubes: Iterable[_Cube], names: Sequence[str]) -> str:
+    def conjunction(cube: _Cube) -> str:
+        literals = (
+            name if cube.holding >> i & 1 else f"!{name}" for i, name in enumerate(names) if cube.named >> i & 1
+        )
+        return " & ".join(literals)
+
+    return " | ".join(map(conjunction, cubes)) or "true"
+
+
+def _cover(on: Collection[int], off: Collection[int]) -> list[_Cube]:
+    """The fewest conjunctions that hold on all of ``on`` and on none of ``off``, and of those the shortest."""
+    primes = sorted({_Cube(named, code & named) for code in on for named in _hitting({code ^ other for other in off})})
+    covers = np.array([[code & cube.named == cube.holding for cube in primes] for code in on])
+    literals = np.array([cube.named.bit_count() for cube in primes])
+    cost = 1 + literals.sum() + literals  # one conjunction less counts for more than any number of literals
+    chosen = milp(cost, integrality=1, bounds=Bounds(0, 1), constraints=LinearConstraint(covers.astype(float), 1)).x
+    return [cube for cube, taken in zip(primes, chosen, strict=True) if taken > 0.5]
+
+
+def _hitting(sets: Collection[int]) -> list[int]:
+    """All minimal sets that meet each of the given ones, by Berge's algorithm."""
+    found = [0]
+    for one in sorted(_minimal(sets), key=int.bit_count):
+        kept = [some for some in found if some & one]
+        members = [1 << i for i in range(one.bit_length()) if one >> i & 1]
+        wider = {some | member for some in found if not some & one for member in members}
+        found = _minimal([*kept, *wider])
+    return found
+
+
+def _minimal(sets: Collection[int]) -> list[int]:
+    """Those without another one inside."""
+    kept: list[int] = []
+    for one in sorted(set(sets), key=int.bit_count):
+        if all(other & ~one for other in kept):
+            kept.append(one)
+    return kept
