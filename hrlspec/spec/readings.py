@@ -82,7 +82,18 @@ def exact_automaton(
 def committed_automaton(
     tree: TaskTree, propositions: Sequence[str], possible_labels: Iterable[Collection[str]]
 ) -> Automaton:
-    """The minimal automaton of the committed reading; see `monitor_automaton`."""
+    """The minimal automaton of the committed reading, made of `monitor_automaton`.
+
+    It is violated where no possible label helps any more, which the monitor, who knows nothing of these, may not see.
+
+    Args:
+        tree: one task over these propositions.
+        propositions: names of the P propositions.
+        possible_labels: the sets of them that can hold together.
+
+    Raises:
+        SpecError: there are too many states.
+    """
     found, _ = monitor_automaton(tree, propositions, possible_labels)
     return Automaton(found.labels, *minimal(found.successors))
 
