@@ -95,7 +95,7 @@ def from_json(text: str, propositions: Sequence[str], possible_labels: Iterable[
         SpecError: see `from_dict`; or the text is no JSON, or not of this form.
     """
     try:
-        found = json.loads(text, object_pairs_hook=_distinct)
+        found = json.loads(text, object_pairs_hook=_distinct, parse_int=str)
     except json.JSONDecodeError as error:
         raise SpecError(f"no JSON: {error.msg}", error.lineno, error.colno) from None
     except RecursionError:
@@ -160,10 +160,10 @@ def _state_of(state: str, row: Any) -> tuple[bool, dict[str, str]]:
 
 
 def _name(state: Any) -> str:
-    """The text by which a state is a key."""
-    if not isinstance(state, str | int):
-        raise SpecError(f"a state is a number or a text, found {_shown(state)}")
-    return json.dumps(state) if isinstance(state, int) else state
+    """The text by which a state is a key; numbers were read as text."""
+    if not isinstance(state, str):
+        raise SpecError(f"a state is a whole number or a text, found {_shown(state)}")
+    return state
 
 
 def _shown(value: object) -> str:

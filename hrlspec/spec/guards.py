@@ -65,13 +65,9 @@ def transitions(automaton: Automaton) -> list[Transition]:
 
 
 def _text(cubes: Iterable[_Cube], names: Sequence[str]) -> str:
-    places = list(enumerate(names))
-
     def conjunction(cube: _Cube) -> str:
-        literals = (
-            name if cube.holding >> i & 1 else f"!{name}" for i, name in enumerate(names) if cube.named >> i & 1
-        )
-        return " & ".join(literals)
+        named = ((i, name) for i, name in enumerate(names) if cube.named >> i & 1)
+        return " & ".join(name if cube.holding >> i & 1 else f"!{name}" for i, name in named)
 
     return " | ".join(map(conjunction, cubes)) or "true"
 

@@ -127,6 +127,33 @@ def test_states_are_told_apart_by_some_continuation() -> None:
         assert len(different) == n * (n - 1)
 
 
+def test_as_many_states_as_the_minimal_one_of_a_library() -> None:
+    """What progression finds, made smaller by automata-lib."""
+    library = pytest.importorskip("automata.fa.dfa")
+    for formula, automaton in random_cases(80, 5):
+        progression = translate.Progression(automaton.labels)
+        rows: dict[str, dict[str, str]] = {"done": {str(column): "done" for column in range(len(automaton.labels))}}
+        pending = [progression.start(formula)]
+        while pending:
+            state = pending.pop()
+            row = rows.setdefault(str(sorted(state)), {})
+            for column in range(len(automaton.labels)):
+                after = progression.after(state, column)
+                over = progression.holds_when_over(after)
+                row[str(column)] = "done" if over else str(sorted(after))
+                if row[str(column)] not in rows:
+                    rows[row[str(column)]] = {}
+                    pending.append(after)
+        whole = library.DFA(
+            states=set(rows),
+            input_symbols={str(column) for column in range(len(automaton.labels))},
+            transitions=rows,
+            initial_state=str(sorted(progression.start(formula))),
+            final_states={"done"},
+        )
+        assert len(whole.minify().states) == automaton.num_states, formula
+
+
 @pytest.mark.parametrize(
     ("text", "trace", "status"),
     [
