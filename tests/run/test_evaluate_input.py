@@ -18,9 +18,14 @@ from hrlspec.run.run_flags import experiments_of, parse_run
 
 ROOT = Path(__file__).parents[2]
 
+# Of each of four propositions none, one, or both are seen.
+MANY = " & ".join(f"F ({name} & X F {name})" for name in "abcd")
 BAD_FLAGS: list[tuple[Sequence[str], str]] = [
     ((), "--run"),
-    (("--run", "run"), "expected exactly one of --spec, --spec-file, --ltl, --ltl-file, --hoa and --suite, found none"),
+    (
+        ("--run", "run"),
+        "expected exactly one of --spec, --spec-file, --ltl, --ltl-file, --hoa, --dfa and --suite, found ",
+    ),
     (("--run", "run", "--spec", "achieve a", "--suite", "dag"), "found --spec and --suite"),
     (("--run", "nowhere", "--suite", "dag"), "nowhere is not a run folder"),
     (("--run", "file", "--suite", "dag"), "file"),
@@ -57,6 +62,38 @@ BAD_FLAGS: list[tuple[Sequence[str], str]] = [
     (("--run", "run", "--hoa", "nothing.hoa"), "cannot read nothing.hoa: No such file"),
     (("--run", "run", "--hoa", "wrong"), "wrong, line 1, column 1: found '#'"),
     (("--run", "run", "--hoa", "empty"), "empty, line 1, column 1: found '#'"),
+    (("--run", "run", "--dfa", "nothing.json"), "cannot read nothing.json: No such file"),
+    (("--run", "run", "--dfa", "wrong"), "wrong, line 1, column 1: no JSON"),
+    (("--run", "run", "--dfa", "binary"), "binary: not UTF-8"),
+    (("--run", "run", "--dfa", "wrong", "--forever"), "--forever goes with --ltl, --ltl-file or --hoa"),
+    (("--run", "run", "--dfa", "wrong", "--hoa", "wrong"), "found --hoa and --dfa"),
+    (("--run", "run", "--suite", "dag", "--semantics", "exact"), "--semantics exact goes with --spec or --spec-file"),
+    (("--run", "run", "--ltl", "F a", "--semantics", "exact"), "--semantics exact goes with --spec or --spec-file"),
+    (("--run", "run", "--spec", "achieve a", "--semantics", "loose"), "--semantics"),
+    (
+        ("--run", "run", "--spec", "achieve a", "--semantics", "exact", "--draw", "w.png"),
+        "--automaton draws one of these",
+    ),
+    (("--run", "run", "--spec-file", "wrong", "--semantics", "exact"), "wrong, line 3, column 9: "),
+    (("--run", "run", "--spec-file", "empty", "--semantics", "exact"), "found no formula"),
+    (("--run", "run", "--spec", "achieve a", "--semantics", "exact"), "no checkpoint in run"),
+    (
+        ("--run", "run", "--ltl", "F a", "--automaton", "task.txt"),
+        "expected a file that ends in one of .dot, .hoa, .json",
+    ),
+    (("--run", "run", "--ltl", "F a", "--automaton", "folder.png"), "--automaton folder.png: expected a file, found a"),
+    (("--run", "run", "--ltl", "F a", "--automaton", "file/x.dot"), "cannot write to file: "),
+    (("--run", "run", "--ltl", "F a", "--automaton", "x.dot"), "no checkpoint in run"),
+    (("--run", "run", "--spec", "achieve a", "--automaton", "x.dot"), "no checkpoint in run"),
+    (("--run", "run", "--suite", "dag", "--automaton", "x.dot"), "--automaton takes one task, found 200"),
+    (
+        ("--run", "run", "--ltl", "GF a", "--forever", "--automaton", "x.json"),
+        "a dictionary holds no task that goes on",
+    ),
+    (
+        ("--run", "run", "--ltl", MANY, "--automaton", "x.png"),
+        "--automaton x.png: the automaton has 82 states, a picture",
+    ),
     (("--run", "run", "--ltl-file", "empty"), "found no formula"),
     (("--run", "run", "--ltl-file", "wrong"), "wrong, line 2, column 9: "),
     (("--run", "run", "--suite", "jaxolotl/cats"), "unknown suite 'jaxolotl/cats'; published ones are: "),
@@ -116,6 +153,83 @@ def test_bad_input(
     assert message in err
     assert len(err) < 1000
     assert contents(place) == before
+
+
+HOA = """HOA: v1 States: 2 Start: 0 AP: 2 "a" "b" Acceptance: 1 Inf(0) --BODY--
+State: 0 [!0] 0 [0] 1
+State: 1 [t] 1 {0} --END--"""
+DFA = """[{"0": [false, {"a": 1, "b": 0, "c": 0, "d": 0, "e": 0}],
+"1": [true, {"a": 1, "b": 1, "c": 1, "d": 1, "e": 1}]}, 0]"""
+WRONG_TASKS = [
+    # Formulas: what is not one, what is read in two ways, what is too large.
+    ("--ltl", "a &", "line 1, column 4: found the end of the text"),
+    ("--ltl", "F (a", "line 1, column 5: found the end of the text"),
+    ("--ltl", "a)", "line 1, column 2: found ')'"),
+    ("--ltl", "a U b U c", "column 7: 'U' beside 'U' is read in two ways; use parentheses"),
+    ("--ltl", "a -> b -> c", "use parentheses"),
+    ("--ltl", "a U", "found the end of the text"),
+    ("--ltl", "F a; F b", "column 4: found ';'"),
+    ("--ltl", "achieve a", "column 9: found 'a'"),
+    ("--ltl", "F 3", "found '3'"),
+    ("--ltl", "!" * 300 + "a", "nested more than 200 deep"),
+    ("--ltl", "F a" + " " * 20_000, "at most 20,000 are read"),
+    ("--ltl", "F A", "'A' is no proposition"),
+    ("--spec", "achieve a ensuring", "line 1, column 19: found the end of the text"),
+    ("--spec", "F a", "line 1, column 1: found 'F'"),
+    # Automata in HOA: text, states, acceptance, and labels beside those of the world.
+    ("--hoa", HOA.replace("v1", "v3"), "line 1, column 6: found 'v3'"),
+    ("--hoa", HOA.replace("Start: 0", "Start: 9"), "found no state 9"),
+    ("--hoa", HOA.replace("[0] 1", "[0] 5"), "found no state 5"),
+    ("--hoa", HOA.replace("[0] 1", "[t] 1"), "a second transition of state 0 for {}"),
+    ("--hoa", HOA.replace('"b"', '"bee"'), "'bee' is no proposition, expected some of a, b, c, d, e"),
+    ("--hoa", HOA.replace("AP: 2", "AP: 3"), "expected the name of a proposition"),
+    ("--hoa", HOA.replace("[0]", "[2]"), "line 2, column 18: found '2', expected a label"),
+    ("--hoa", HOA.replace("1 Inf(0)", "1 Fin(0)"), "found the acceptance 1 Fin ( 0 ), expected Büchi"),
+    ("--hoa", HOA.replace("--END--", ""), "expected '--END--'"),
+    ("--hoa", HOA + HOA, "expected the end of the text: one automaton"),
+    ("--hoa", DFA, "line 1, column 6: found ':', expected a word of the HOA format"),
+    # Dictionaries: JSON, states, whether they accept, letters.
+    ("--dfa", HOA, "line 1, column 1: no JSON"),
+    ("--dfa", DFA[:-1], "no JSON"),
+    ("--dfa", "[" * 50_000, "nested too deep"),
+    ("--dfa", "{}", "expected a list of two"),
+    ("--dfa", "[{}, 0]", "found no state '0', with which it starts"),
+    ("--dfa", DFA.replace("}, 0]", "}, 7]"), "found no state '7', with which it starts"),
+    ("--dfa", DFA.replace('"1":', '"0":'), "'0' is there twice"),
+    ("--dfa", DFA.replace('"a": 1, "b": 0', '"a": 4, "b": 0'), "found no state '4', to which 'a' leads from state '0'"),
+    ("--dfa", DFA.replace("true", '"yes"'), "state '1' has the label 'yes', expected true or false"),
+    ("--dfa", DFA.replace("[true, ", "["), "state '1': expected a list of two"),
+    ("--dfa", DFA.replace("}, 0]", "}, null]"), "a state is a whole number or a text, found None"),
+    # Sets of propositions.
+    ("--dfa", DFA.replace('"e": 0', '"z": 0'), "letter 'z': 'z' is no proposition, expected some of a, b, c, d, e"),
+    ("--dfa", DFA.replace('"e": 0', '"5": 0'), "letter '5': 5 is no proposition"),
+    ("--dfa", DFA.replace('"e": 0', '"a&&b": 0'), "letter 'a&&b': '' is no proposition"),
+    ("--dfa", DFA.replace('"e": 0', '"a|b": 0'), "letter 'a|b': 'a|b' is no proposition"),
+    ("--dfa", DFA.replace(', "e": 0', ""), "state '0' has no letter for {e}, which can hold"),
+    ("--dfa", DFA.replace('"e": 0', '"e": 0, "4": 0'), "state '0' has two letters for what '4' says"),
+]
+
+
+@pytest.mark.parametrize(("flag", "task", "message"), WRONG_TASKS, ids=range(len(WRONG_TASKS)))
+def test_tasks_that_are_refused(
+    flag: str, task: str, message: str, place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a file the message names it."""
+    file = tmp_path / "task"
+    before = contents(place)
+    if flag in ("--hoa", "--dfa"):
+        file.write_text(task, encoding="utf-8")
+    flags = ["--run", str(place / "run"), flag, str(file) if file.exists() else task]
+    flags += ["--automaton", str(tmp_path / "written.dot")]
+    assert main_guard(lambda: evaluate.main(flags)) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("error: task" if file.exists() else f"error: {flag}, ")
+    assert err.count("\n") == 1
+    assert message in err
+    assert len(err) < 300
+    assert contents(place) == before
+    assert not (tmp_path / "written.dot").exists()
 
 
 def test_bad_input_in_a_process_of_its_own(place: Path) -> None:

@@ -8,6 +8,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from hrlspec.spec import SATISFIED, VIOLATED, advance, compile_task, draw_task, initial, parse
+from hrlspec.spec.draw_automaton import MAX_DRAWN, draw_automaton
+from hrlspec.spec.ltl import parse_ltl, to_automaton, to_buchi
 from tests.spec.tasks import NAMES
 
 TASK = compile_task(parse("achieve a ensuring not e; (achieve b or achieve c and d) or achieve d"), NAMES, 12)
@@ -60,7 +62,37 @@ def test_names_must_match() -> None:
         draw_task(TASK, ["a"])
 
 
+def test_an_automaton_carries_short_guards() -> None:
+    labels = [set(), *NAMES]
+    texts = _texts(draw_automaton(to_automaton(parse_ltl("!a U (b & (!c U d))"), NAMES, labels)))
+    # Of the rejecting and the accepting state nothing more is said.
+    assert texts == {*"01234", "", *"abcd", "↻ ¬a∧¬b", "↻ ¬a∧¬c∧¬d", "↻ ¬c∧¬d"}
+    texts = _texts(draw_automaton(to_buchi(parse_ltl("GF (a | b) & GF c"), NAMES, labels)))
+    assert {"a ∨\nb", "● c"} <= texts
+    one = draw_automaton(to_buchi(parse_ltl("GF a"), NAMES, labels))
+    assert "↻ ¬a\n● a" in _texts(one)
+    figure = Figure()
+    assert draw_automaton(to_automaton(parse_ltl("false"), NAMES, labels), figure.subplots()) is figure
+    assert _texts(figure) == {"0", ""}
+
+
+def test_pictures_of_automata_tell_them_apart() -> None:
+    labels = [set(), *NAMES]
+    ways = [to_automaton, to_buchi]
+    pictures = [_png(draw_automaton(way(parse_ltl(text), NAMES, labels))) for way in ways for text in ("F a", "!b U a")]
+    assert len(set(pictures)) == 4
+
+
+def test_an_automaton_too_large_for_a_picture_is_refused() -> None:
+    large = to_automaton(parse_ltl(" & ".join(f"F ({name} & X F {name})" for name in "abcd")), NAMES)
+    assert large.num_states > MAX_DRAWN
+    with pytest.raises(ValueError, match=f"has {large.num_states} states, a picture shows {MAX_DRAWN} at most"):
+        draw_automaton(large)
+
+
 def test_missing_libraries_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "networkx", None)
     with pytest.raises(ImportError, match=r"hrlspec\[plot\]"):
         draw_task(TASK, NAMES)
+    with pytest.raises(ImportError, match=r"hrlspec\[plot\]"):
+        draw_automaton(to_automaton(parse_ltl("F a"), NAMES))
