@@ -100,14 +100,13 @@ def until_accepting(automaton: Automaton) -> Automaton:
 
 
 def to_hoa(automaton: Automaton, name: str = "") -> str:
-    """Text of an automaton; of a finite task every transition out of the accepting state accepts.
+    """Text of an automaton; of a finite task every transition into the accepting state accepts, and so all that follow.
 
     Labels that cannot occur have no transition.
     """
     names = sorted(frozenset().union(*automaton.labels))
     place = {proposition: number for number, proposition in enumerate(names)}
-    accepting = np.arange(automaton.num_states) == automaton.accepting
-    marks = automaton.marks if automaton.marks is not None else np.repeat(accepting[:, None], len(automaton.labels), 1)
+    marks = automaton.successors == automaton.accepting if automaton.marks is None else automaton.marks
 
     def guard(label: Label) -> str:
         literals = (str(place[x]) if x in label else f"!{place[x]}" for x in names)

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 import envs_jax
-from hrlspec.evaluation import evaluate_ltl, ltl_suite, run_episodes
+from hrlspec.evaluation import evaluate_ltl, exact_suite, ltl_suite, run_episodes
 from hrlspec.evaluation.episodes import _run, trace_episodes
 from hrlspec.presets.peers import go_on_for_ever, peer_formulas, peer_suites
-from hrlspec.spec import compile_task, parse
+from hrlspec.spec import SpecError, compile_task, parse
 from hrlspec.spec.automata import Automata, automata_of
 from hrlspec.spec.ltl import parse_ltl, satisfies_ltl, to_automaton
+from hrlspec.spec.readings import monitor_automaton
 from hrlspec.tasks.rewards import reward_machine
 from tests.evaluation.scripted import manner, walker
 
@@ -56,6 +57,43 @@ def test_step_for_step_as_on_the_tree(last: bool) -> None:
         places = (np.asarray(some.env_state.position)[np.asarray(some.running)] for some in (trace, other_trace))
         np.testing.assert_array_equal(*places)
         assert np.asarray(on_tree.success).all()
+
+
+@pytest.mark.parametrize("last", [False, True])
+def test_a_tree_as_an_automaton_is_carried_out_step_for_step_as_the_tree(last: bool) -> None:
+    """Whichever edge the planner takes, with edges that become blocked; of edges met at once it is told nothing."""
+    texts = (
+        "(achieve a; achieve b) ensuring not c or achieve d; achieve e",
+        "achieve a ensuring not b or achieve b ensuring not a; achieve c; achieve d ensuring not e",
+        "(achieve a or achieve b or achieve c) ensuring not d; (achieve a or achieve e) ensuring not c",
+        "achieve e or (achieve a; achieve b or achieve c; achieve d)",
+    )
+    count = 6 * len(texts)
+    trees = [compile_task(parse(text), NAMES, 16, on_host=True) for text in texts]
+    each = [monitor_automaton(tree, NAMES, LETTER.possible_labels) for tree in trees]
+    shown = [trees for _, trees in each]
+    together, *_ = automata_of([automaton for automaton, _ in each], NAMES, 16, trees=shown)
+    some, which = layouts(count, seed=11), np.arange(count) % len(texts)
+    stacked = jax.tree.map(lambda *x: np.stack([x[i] for i in which]), *trees)
+    how = {"greedy": True}
+    on_trees, trace = trace_episodes(KEY, WALKER, manner(last=last), COMPLETION, stacked, some, **how)
+    on_automata, other = trace_episodes(KEY, WALKER, manner(last=last), COMPLETION, together, some, which=which, **how)
+    jax.tree.map(np.testing.assert_array_equal, on_trees, on_automata)
+    np.testing.assert_array_equal(trace.running, other.running)
+    places = (np.asarray(one.env_state.position)[np.asarray(one.running)] for one in (trace, other))
+    np.testing.assert_array_equal(*places)
+    assert np.asarray(on_trees.success).mean() > 0.5
+
+
+def test_a_task_that_no_tree_can_say_is_carried_out_in_its_exact_reading() -> None:
+    """c after b: for the monitor it is over; here b is sought again."""
+    suite = exact_suite("some", "achieve b; (achieve d ensuring not c)\nachieve a ensuring not a", LETTER)
+    assert suite.num_states.tolist() == [3, 1]
+    found = evaluate_ltl(KEY, WALKER, manner(), COMPLETION, suite, episodes=40, greedy=True)
+    assert [score.success_rate.estimate for score in found.per_formula] == [1, 0]
+    assert found.per_formula[0].formula == "achieve b; (achieve d ensuring not c)"
+    with pytest.raises(SpecError, match="some, line 2, column 9: found ';'"):
+        exact_suite("some", "achieve a\nachieve ;", LETTER)
 
 
 def test_a_second_try() -> None:

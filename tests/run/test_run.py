@@ -29,6 +29,8 @@ from hrlspec.run.experiment import experiment_of
 from hrlspec.run.folder import read_metrics, read_record
 from hrlspec.run.learner import Learner
 from hrlspec.run.progress import ProgressDisplay
+from hrlspec.spec import RUNNING, SATISFIED
+from hrlspec.spec.dfa import from_json
 from tests.run import tiny
 
 ROOT = Path(__file__).parents[2]
@@ -329,6 +331,41 @@ def test_what_cannot_be_drawn_costs_one_line(
     out, err = capsys.readouterr()
     assert json.loads(out)["episodes"] == 20
     assert err == f"error: {said}\n"
+
+
+def test_an_automaton_is_written_and_read_again(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What no tree says, in every form; read again it is the same task, and goes the same way."""
+
+    def report(*flags: str) -> dict[str, Any]:
+        given = ["--run", str(finished), *flags, "--episodes", "20", "--json"]
+        assert main_guard(lambda: evaluate.main(given)) == 0
+        found: dict[str, Any] = json.loads(capsys.readouterr().out)
+        (scores,) = found["per_formula"]
+        return scores
+
+    files = [tmp_path / "new" / f"task.{form}" for form in ("dot", "svg", "hoa", "json")]
+    spec = ("--spec", "achieve b; (achieve d ensuring not c)", "--semantics", "exact")
+    first = report(*spec, "--automaton", str(files[0]))
+    assert (first["formula"], first["automaton_states"]) == (spec[1], 3)
+    assert '  1 -> 0 [label="c"]\n' in files[0].read_text()
+    for file in files[1:]:
+        assert report(*spec, "--automaton", str(file)) == first
+    assert files[1].read_text().startswith("<?xml")
+    for flag, file in (("--hoa", files[2]), ("--dfa", files[3])):
+        assert report(flag, str(file)) == first | {"formula": file.name}
+
+
+def test_the_automaton_of_a_tree_is_written_beside_its_results(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--run", str(finished), "--spec", LARGE, "--episodes", "20", "--json"]
+    assert main_guard(lambda: evaluate.main([*flags, "--automaton", str(tmp_path / "task.json")])) == 0
+    assert json.loads(capsys.readouterr().out)["episodes"] == 20
+    automaton = from_json((tmp_path / "task.json").read_text(), "abcde", [set(), *"abcde"])
+    assert automaton.run("aabceebac") == SATISFIED
+    assert automaton.run("abceba") == RUNNING
 
 
 def test_evaluate_prints_a_table(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
