@@ -27,7 +27,9 @@ from hrlspec.spec import (
     syntax,
     task_hash,
 )
+from hrlspec.spec.dfa import from_json
 from hrlspec.spec.ltl import parse_ltl, satisfies_ltl, to_automaton, to_buchi
+from hrlspec.spec.readings import committed_automaton, exact_automaton
 from tests.spec.tasks import NAMES
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -138,6 +140,26 @@ def test_twins_agree_and_differ_where_the_page_says(lines: list[str]) -> None:
     (text, _, ltl), (trace, said) = lines[0].partition(" | "), _split(lines[1])
     automaton = to_automaton(parse_ltl(ltl), "abcd", LABELS)
     assert f"{_monitor(text, trace)}, {STATUS[automaton.run(trace)]}" == said
+
+
+@pytest.mark.filterwarnings("ignore::hrlspec.spec.SpecWarning")
+@pytest.mark.parametrize("lines", _blocks("tasks.md", "readings"), ids=" | ".join)
+def test_readings_differ_where_the_page_says(lines: list[str]) -> None:
+    formula, (trace, said) = parse(lines[0]), _split(lines[1])
+    try:
+        committed = STATUS[committed_automaton(compile_task(formula, list("abcd"), 16), "abcd", LABELS).run(trace)]
+    except SpecError:
+        committed = "refused"
+    exact = STATUS[exact_automaton(formula, "abcd", LABELS).run(trace)]
+    assert f"committed {committed}, exact {exact}" == said
+    assert committed == _monitor(lines[0], trace)
+    assert satisfies(formula, trace) == (exact == "satisfied")
+
+
+@pytest.mark.parametrize("lines", _blocks("tasks.md", "dfa"), ids=" | ".join)
+def test_a_dictionary_means_what_the_page_says(lines: list[str]) -> None:
+    trace, said = _split(lines[1])
+    assert STATUS[from_json(lines[0], "ab", [set(), "a", "b"]).run(trace)] == said
 
 
 def test_the_page_names_all_published_suites() -> None:
