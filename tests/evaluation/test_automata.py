@@ -87,11 +87,12 @@ def test_a_tree_as_an_automaton_is_carried_out_step_for_step_as_the_tree(last: b
 
 def test_a_task_that_no_tree_can_say_is_carried_out_in_its_exact_reading() -> None:
     """c after b: for the monitor it is over; here b is sought again."""
-    suite = exact_suite("some", "achieve b; (achieve d ensuring not c)\nachieve a ensuring not a", LETTER)
-    assert suite.num_states.tolist() == [3, 1]
+    text = "achieve a; ((achieve b; achieve d) ensuring not c)"
+    suite = exact_suite("some", f"{text}\nachieve a ensuring not a", LETTER)
+    assert suite.num_states.tolist() == [4, 1]
     found = evaluate_ltl(KEY, WALKER, manner(), COMPLETION, suite, episodes=40, greedy=True)
     assert [score.success_rate.estimate for score in found.per_formula] == [1, 0]
-    assert found.per_formula[0].formula == "achieve b; (achieve d ensuring not c)"
+    assert found.per_formula[0].formula == text
     with pytest.raises(SpecError, match="some, line 2, column 9: found ';'"):
         exact_suite("some", "achieve a\nachieve ;", LETTER)
 

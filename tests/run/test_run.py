@@ -346,10 +346,10 @@ def test_an_automaton_is_written_and_read_again(
         return scores
 
     files = [tmp_path / "new" / f"task.{form}" for form in ("dot", "svg", "hoa", "json")]
-    spec = ("--spec", "achieve b; (achieve d ensuring not c)", "--semantics", "exact")
+    spec = ("--spec", "achieve a; ((achieve b; achieve d) ensuring not c)", "--semantics", "exact")
     first = report(*spec, "--automaton", str(files[0]))
-    assert (first["formula"], first["automaton_states"]) == (spec[1], 3)
-    assert '  1 -> 0 [label="c"]\n' in files[0].read_text()
+    assert (first["formula"], first["automaton_states"]) == (spec[1], 4)
+    assert '  2 -> 1 [label="c"]\n' in files[0].read_text()
     for file in files[1:]:
         assert report(*spec, "--automaton", str(file)) == first
     assert files[1].read_text().startswith("<?xml")
