@@ -7,15 +7,15 @@ from pathlib import Path
 
 from hrlspec.run.errors import UserError
 from hrlspec.run.extras import check_drawing, drawing
-from hrlspec.run.folder import check_writable
+from hrlspec.run.folder import check_file
 from hrlspec.spec.dfa import to_dict
 from hrlspec.spec.dot import to_dot
 from hrlspec.spec.draw_automaton import MAX_DRAWN
 from hrlspec.spec.hoa import to_hoa
 from hrlspec.spec.ltl import Automaton
 
-_PICTURES = (".png", ".svg")
-_ENDINGS = (".dot", ".hoa", ".json", *_PICTURES)
+PICTURES = (".png", ".svg")
+_ENDINGS = (".dot", ".hoa", ".json", *PICTURES)
 
 
 def check_automaton_file(flag: str, file: Path) -> None:
@@ -24,12 +24,8 @@ def check_automaton_file(flag: str, file: Path) -> None:
     Raises:
         UserError: the form is unknown, nothing can be written there, or there is no drawing library for a picture.
     """
-    if file.suffix not in _ENDINGS:
-        raise UserError(f"{flag} {file}: expected a file that ends in one of {', '.join(_ENDINGS)}")
-    if file.is_dir():
-        raise UserError(f"{flag} {file}: expected a file, found a folder")
-    check_writable(file.parent)
-    if file.suffix in _PICTURES:
+    check_file(flag, file, _ENDINGS)
+    if file.suffix in PICTURES:
         check_drawing()
 
 
@@ -39,7 +35,7 @@ def check_automaton(flag: str, file: Path, automaton: Automaton) -> None:
     Raises:
         UserError: it is too large for a picture, or its task goes on for ever, for which dictionaries have no place.
     """
-    if file.suffix in _PICTURES and automaton.num_states > MAX_DRAWN:
+    if file.suffix in PICTURES and automaton.num_states > MAX_DRAWN:
         found = f"the automaton has {automaton.num_states} states, a picture shows {MAX_DRAWN} at most"
         raise UserError(f"{flag} {file}: {found}; .dot and .hoa hold any number")
     if file.suffix == ".json" and automaton.marks is not None:
@@ -53,7 +49,7 @@ def write_automaton(automaton: Automaton, task: str, file: Path) -> None:
         UserError: it cannot be drawn.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
-    if file.suffix in _PICTURES:
+    if file.suffix in PICTURES:
         with drawing():
             from hrlspec.run import plots
 

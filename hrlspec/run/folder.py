@@ -198,6 +198,19 @@ def holds_run(folder: Path) -> bool:
         return (folder / "config.json").exists()
 
 
+def check_file(flag: str, file: Path, endings: Sequence[str]) -> None:
+    """Whether a file that a flag names can be written, before the work for it begins.
+
+    Raises:
+        UserError: it has another ending, is a folder, or nothing can be written there.
+    """
+    if file.suffix not in endings:
+        raise UserError(f"{flag} {file}: expected a file that ends in {', '.join(endings[:-1])} or {endings[-1]}")
+    if file.is_dir():
+        raise UserError(f"{flag} {file}: expected a file, found a folder")
+    check_writable(file.parent)
+
+
 def check_writable(folder: Path) -> None:
     """Refuses a folder in which nothing can be made, or which cannot be made.
 

@@ -79,7 +79,7 @@ BAD_FLAGS: list[tuple[Sequence[str], str]] = [
     (("--run", "run", "--spec", "achieve a", "--semantics", "exact"), "no checkpoint in run"),
     (
         ("--run", "run", "--ltl", "F a", "--automaton", "task.txt"),
-        "expected a file that ends in one of .dot, .hoa, .json",
+        "ends in .dot, .hoa, .json, .png or .svg",
     ),
     (("--run", "run", "--ltl", "F a", "--automaton", "folder.png"), "--automaton folder.png: expected a file, found a"),
     (("--run", "run", "--ltl", "F a", "--automaton", "file/x.dot"), "cannot write to file: "),

@@ -35,13 +35,13 @@ from hrlspec.evaluation.ltl import check_propositions, suite_of_automata
 from hrlspec.evaluation.suite import MAX_NODES
 from hrlspec.presets.peers import go_on_for_ever, peer_formulas
 from hrlspec.run import platform
-from hrlspec.run.automaton_file import check_automaton, check_automaton_file, write_automaton
+from hrlspec.run.automaton_file import PICTURES, check_automaton, check_automaton_file, write_automaton
 from hrlspec.run.console import result_console
 from hrlspec.run.errors import UserError
 from hrlspec.run.experiment import Experiment, experiment_of
 from hrlspec.run.extras import check_drawing, drawing
 from hrlspec.run.flags import parse_flags
-from hrlspec.run.folder import check_writable, read_record
+from hrlspec.run.folder import check_file, read_record
 from hrlspec.run.tables import ltl_table, suite_table
 from hrlspec.run.unseen import with_tasks
 from hrlspec.spec import SpecError, bare_lines
@@ -287,10 +287,6 @@ def _check(flags: EvaluateFlags) -> None:
         raise UserError(f"--semantics {flags.semantics} goes with --spec or --spec-file")
     if flags.automaton is not None:
         check_automaton_file("--automaton", flags.automaton)
-    if flags.draw is not None and flags.draw.suffix not in (".png", ".svg"):
-        raise UserError(f"--draw {flags.draw}: expected a file that ends in .png or .svg")
     if flags.draw is not None:
-        if flags.draw.is_dir():
-            raise UserError(f"--draw {flags.draw}: expected a file, found a folder")
-        check_writable(flags.draw.parent)
+        check_file("--draw", flags.draw, PICTURES)
         check_drawing()
