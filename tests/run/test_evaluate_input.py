@@ -77,10 +77,7 @@ BAD_FLAGS: list[tuple[Sequence[str], str]] = [
     (("--run", "run", "--spec-file", "wrong", "--semantics", "exact"), "wrong, line 3, column 9: "),
     (("--run", "run", "--spec-file", "empty", "--semantics", "exact"), "found no formula"),
     (("--run", "run", "--spec", "achieve a", "--semantics", "exact"), "no checkpoint in run"),
-    (
-        ("--run", "run", "--ltl", "F a", "--automaton", "task.txt"),
-        "ends in .dot, .hoa, .json, .png or .svg",
-    ),
+    (("--run", "run", "--ltl", "F a", "--automaton", "task.txt"), "ends in .dot, .hoa, .json, .png or .svg"),
     (("--run", "run", "--ltl", "F a", "--automaton", "folder.png"), "--automaton folder.png: expected a file, found a"),
     (("--run", "run", "--ltl", "F a", "--automaton", "file/x.dot"), "cannot write to file: "),
     (("--run", "run", "--ltl", "F a", "--automaton", "x.dot"), "no checkpoint in run"),
