@@ -62,7 +62,7 @@ def tasks(count: int, seed: int) -> list[tuple[Formula, TaskTree]]:
     return found
 
 
-@pytest.mark.parametrize(("count", "traces"), [(200, 15), pytest.param(4000, 25, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("count", "traces"), [(120, 25), pytest.param(4000, 25, marks=pytest.mark.slow)])
 def test_the_exact_automaton_accepts_what_satisfies_the_formula(count: int, traces: int) -> None:
     rng = random.Random(0)
     verdicts = []
@@ -113,7 +113,7 @@ def test_what_is_no_formula_in_ltl_is_refused() -> None:
         exact_automaton(parse("achieve z"), NAMES, ONE)
 
 
-@pytest.mark.parametrize(("count", "traces"), [(100, 20), pytest.param(1500, 70, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("count", "traces"), [(60, 35), pytest.param(1500, 70, marks=pytest.mark.slow)])
 def test_the_committed_automaton_is_the_monitor(count: int, traces: int) -> None:
     """By the rules in words, after every step of every trace."""
     rng = random.Random(1)
