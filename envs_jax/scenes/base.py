@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -37,6 +37,44 @@ class Leg:
     reached: bool
 
 
+@dataclasses.dataclass(frozen=True)
+class Shape:
+    """Something to see from above, in a picture whose y points down.
+
+    Attributes:
+        kind: a disc, the square of a cell, or one that cannot be entered.
+        name: the proposition that it stands for, or what else it is; a wall has none.
+        x: of the middle.
+        y: of the middle, downwards.
+        radius: of the disc, or half a square's side.
+        color: red, green and blue, 0 to 255, if the name is that of a colour.
+    """
+
+    kind: Literal["disc", "cell", "wall"]
+    name: str
+    x: float
+    y: float
+    radius: float
+    color: tuple[int, int, int] | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Outline:
+    """A layout as shapes, for whoever draws it with means of their own.
+
+    Attributes:
+        width: of the picture.
+        height: of the picture, in the same units.
+        shapes: what there is to see; later ones lie on top.
+        cell: side of a cell, or ``None`` where the agent moves freely. A move that is longer leads over the edge.
+    """
+
+    width: float
+    height: float
+    shapes: tuple[Shape, ...]
+    cell: float | None
+
+
 class Scene(abc.ABC):
     """A layout as something to look at: a small value that draws itself, and an agent's path in it."""
 
@@ -62,3 +100,15 @@ class Scene(abc.ABC):
         Returns:
             uint8 ``[H, W, 3]``, first row on top, the same size for every moment.
         """
+
+    def outline(self) -> Outline | None:
+        """The layout as shapes; ``None`` where there is nothing to see from above."""
+        return None
+
+    def in_outline(self, positions: np.ndarray) -> np.ndarray:
+        """Positions ``[t + 1, D]`` as they lie in the outline.
+
+        Returns:
+            float ``[t + 1, 2]``, x and y, or ``[t + 1, 3]`` with a heading in radians, clockwise from the right.
+        """
+        return np.asarray(positions, float)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from envs_jax.scenes.base import PATH_COLORS, Leg, Scene
-from envs_jax.scenes.glyphs import BACKGROUND, INK, LINE, color_of, glyph
+from envs_jax.scenes.base import PATH_COLORS, Leg, Outline, Scene, Shape
+from envs_jax.scenes.glyphs import BACKGROUND, INK, LINE, color_of, glyph, own_color
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -116,6 +116,22 @@ class DiscScene(Scene):
                 _dot(image, x, y, (1 - share) * here[:2] + share * nose, 2 * unit)
         image[0], image[-1], image[:, 0], image[:, -1] = LINE, LINE, LINE, LINE
         return image
+
+    def outline(self) -> Outline:
+        """See :class:`Scene`; a unit is one of the scene's."""
+        side = self.high - self.low
+        shapes = (
+            Shape("disc", x.name, x.x - self.low, self.high - x.y, x.radius, own_color(x.name)) for x in self.regions
+        )
+        return Outline(side, side, tuple(shapes), None)
+
+    def in_outline(self, positions: np.ndarray) -> np.ndarray:
+        """See :class:`Scene`."""
+        path = np.array(positions, float)
+        path[:, 0] -= self.low
+        path[:, 1] = self.high - path[:, 1]
+        path[:, 2:] *= -1
+        return path
 
     def _draw_regions(self, ax: Axes, chosen: Collection[int], avoided: Collection[str]) -> None:
         """The regions with their names, on axes of equal scale without ticks."""

@@ -32,13 +32,18 @@ _COLORS = {
 }
 
 
+def own_color(name: str) -> tuple[int, int, int] | None:
+    """Red, green and blue of a name that is a colour's."""
+    return _COLORS.get(name)
+
+
 def color_of(name: str) -> tuple[int, int, int]:
     """Red, green and blue of a proposition: the name's own if it is a colour, else one for its first letter.
 
     Hues are spread by the golden ratio, so that neighbours in the alphabet differ.
     """
-    if name in _COLORS:
-        return _COLORS[name]
+    if (own := own_color(name)) is not None:
+        return own
     letter = ord(name[0].lower()) - ord("a")
     red, green, blue = colorsys.hsv_to_rgb((0.02 + letter * 0.618034) % 1.0, 0.45, 0.93)
     return round(red * 255), round(green * 255), round(blue * 255)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from envs_jax.scenes.base import PATH_COLORS, Leg, Scene
-from envs_jax.scenes.glyphs import BACKGROUND, INK, LINE, color_of, glyph
+from envs_jax.scenes.base import PATH_COLORS, Leg, Outline, Scene, Shape
+from envs_jax.scenes.glyphs import BACKGROUND, INK, LINE, color_of, glyph, own_color
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -89,6 +89,22 @@ class GridScene(Scene):
         image[:, :, 0, :] = LINE
         image[:, :, :, 0] = LINE
         return image.transpose(0, 2, 1, 3, 4).reshape(height * side, width * side, 3)
+
+    def outline(self) -> Outline:
+        """See :class:`Scene`; a cell is a unit."""
+        height, width = self.shape
+        named = (
+            Shape("cell", name, column + 0.5, row + 0.5, 0.5, own_color(name))
+            for row, names in enumerate(self.cells)
+            for column, name in enumerate(names)
+            if name
+        )
+        walls = (Shape("wall", "", column + 0.5, row + 0.5, 0.5, None) for row, column in self.walls)
+        return Outline(float(width), float(height), (*named, *walls), 1.0)
+
+    def in_outline(self, positions: np.ndarray) -> np.ndarray:
+        """See :class:`Scene`."""
+        return np.asarray(positions, float)[:, ::-1] + 0.5
 
     def _inside(self, position: np.ndarray) -> tuple[int, int]:
         """A position as row and column, or ``ValueError``."""

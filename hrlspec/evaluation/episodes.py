@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,11 +19,14 @@ from jaxtyping import Bool, Float32, Int, Int32, Key
 from envs_jax.arrays import Array
 from envs_jax.base import Layout, State
 from hrlspec.agent.agent import Agent
-from hrlspec.agent.interaction import act, assign, start, transition
-from hrlspec.agent.low_level import Params
+from hrlspec.agent.experience import LowDecision, Outcome
+from hrlspec.agent.interaction import Worker, act, assign, start, transition
+from hrlspec.agent.low_level import Params, TaskBook
 from hrlspec.spec import TaskTree
 from hrlspec.spec.automata import Automata
 from hrlspec.tasks.rewards import RewardMachine
+
+Seen = TypeVar("Seen")
 
 
 @struct.dataclass
@@ -59,6 +63,34 @@ class Trace:
     node: Int32[Array, "*lead B"]
     assigned: Int32[Array, "*lead B"]
     running: Bool[Array, "*lead B"]
+
+
+class Moment(NamedTuple):
+    """One step of B episodes, for whoever watches them.
+
+    Attributes:
+        agent: both levels.
+        params: their parameters.
+        book: the tasks.
+        before: where world and task stood, the sub-task in force assigned.
+        low: what the low level decided.
+        outcome: what came of it.
+        after: where world and task stand then.
+        running: bool ``[B]``, the episode had not ended before.
+    """
+
+    agent: Agent
+    params: Params
+    book: TaskBook
+    before: Worker
+    low: LowDecision
+    outcome: Outcome
+    after: Worker
+    running: Bool[Array, " B"]
+
+
+Watch = Callable[[Moment], Seen]
+"""What is kept of a step: a pure function, of a module's top level, so that programs with it compile once."""
 
 
 def run_episodes(
@@ -103,7 +135,7 @@ def run_episodes(
         rows = np.arange(first, first + chunk) % total
         some = jax.tree.map(lambda x, rows=rows: x[rows], layouts)
         begun = _begun(tasks, which[rows])
-        episodes, _ = _run(jax.random.fold_in(key, first), agent, params, machine, *begun, some, greedy, shield, False)
+        episodes, _ = _run(jax.random.fold_in(key, first), agent, params, machine, *begun, some, greedy, shield, None)
         parts.append(jax.tree.map(lambda x, n=total - first: x[:n], episodes))
     return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
@@ -121,10 +153,34 @@ def trace_episodes(
     shield: bool = False,
 ) -> tuple[Episodes, Trace]:
     """As :func:`run_episodes`, for a few episodes, with their trajectories."""
+    how: dict[str, Any] = {"which": which, "greedy": greedy, "shield": shield}
+    return watch_episodes(key, agent, params, machine, tasks, layouts, _way, **how)
+
+
+def watch_episodes(
+    key: Key[Array, ""],
+    agent: Agent,
+    params: Params,
+    machine: RewardMachine,
+    tasks: TaskTree | Automata,
+    layouts: Layout,
+    watch: Watch[Seen],
+    *,
+    which: Int[np.ndarray, " B"] | None = None,
+    greedy: bool = False,
+    shield: bool = False,
+) -> tuple[Episodes, Seen]:
+    """As :func:`run_episodes`, for a few episodes, with what ``watch`` keeps of each step, leading axis H.
+
+    Watching changes nothing of what happens.
+    """
     which = _which(tasks, layouts, which)
-    episodes, trace = _run(key, agent, params, machine, *_begun(tasks, which), layouts, greedy, shield, True)
-    assert trace is not None
-    return episodes, trace
+    return _run(key, agent, params, machine, *_begun(tasks, which), layouts, greedy, shield, watch)
+
+
+def _way(moment: Moment) -> Trace:
+    before = moment.before
+    return Trace(before.env_state, before.task_state.node, before.decision.edge, moment.running)
 
 
 def _which(tasks: TaskTree | Automata, layouts: Layout, which: Int[np.ndarray, " B"] | None) -> Int[np.ndarray, " B"]:
@@ -152,7 +208,7 @@ def _begun(tasks: TaskTree | Automata, which: Int[np.ndarray, " B"]) -> tuple[Ta
     return jax.tree.map(lambda x: x[which], tasks), jnp.arange(len(which), dtype=jnp.int32)
 
 
-@functools.partial(jax.jit, static_argnames=("agent", "greedy", "shield", "traced"))
+@functools.partial(jax.jit, static_argnames=("agent", "greedy", "shield", "watch"))
 def _run(
     key: Key[Array, ""],
     agent: Agent,
@@ -163,8 +219,8 @@ def _run(
     layouts: Layout,
     greedy: bool,
     shield: bool,
-    traced: bool,
-) -> tuple[Episodes, Trace | None]:
+    watch: Watch[Any] | None,
+) -> tuple[Episodes, Any]:
     env, book = agent.env, agent.low.prepare(params, tasks)
     num_episodes, num_nodes = rows.shape[0], book.tree.num_nodes
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num_episodes, dtype=jnp.int32))
@@ -174,7 +230,7 @@ def _run(
     none = zeros.astype(jnp.int32)
     outcome = Episodes(success=zeros > 0, violated=zeros > 0, steps=none, returns=zeros, rounds=none)
 
-    def step(carry: tuple[Any, ...]) -> tuple[tuple[Any, ...], Trace]:
+    def step(carry: tuple[Any, ...]) -> tuple[tuple[Any, ...], Any]:
         worker, outcome, running, time = carry
         step_key, plan_key, act_key = jax.random.split(jax.random.fold_in(key, num_episodes + time), 3)
         worker = dataclasses.replace(worker, awaiting=worker.awaiting & running)
@@ -182,9 +238,9 @@ def _run(
         worker = assign(agent, params, book, worker, noise)
         noise = noise_scale * agent.low.actions.noise(act_key, (num_episodes,))
         reach = jax.vmap(agent.low.reach_values, (None, 0))(params, worker.view) if shield else None
-        action = act(agent, params, book, worker, noise, reach).action
-        seen = Trace(worker.env_state, worker.task_state.node, worker.decision.edge, running)
-        worker, result = transition(jax.random.split(step_key, num_episodes), env, machine, book, worker, action)
+        low, before = act(agent, params, book, worker, noise, reach), worker
+        worker, result = transition(jax.random.split(step_key, num_episodes), env, machine, book, before, low.action)
+        seen = watch and watch(Moment(agent, params, book, before, low, result, worker, running))
         outcome = Episodes(
             success=outcome.success | (running & result.satisfied),
             violated=outcome.violated | (running & result.terminated & ~result.satisfied),
@@ -196,7 +252,7 @@ def _run(
         return (worker, outcome, running, time + 1), seen
 
     carry = (worker, outcome, jnp.ones(num_episodes, bool), jnp.int32(0))
-    if traced:
-        carry, trace = jax.lax.scan(lambda c, _: step(c), carry, length=env.horizon)
-        return carry[1], trace
+    if watch:
+        carry, seen = jax.lax.scan(lambda c, _: step(c), carry, length=env.horizon)
+        return carry[1], seen
     return jax.lax.while_loop(lambda c: c[2].any(), lambda c: step(c)[0], carry)[1], None

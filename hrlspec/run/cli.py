@@ -18,6 +18,7 @@ from hrlspec.version import __version__
 COMMANDS = {
     "run": "train an agent, evaluate it on unseen tasks, draw what it does",
     "evaluate": "evaluate a trained agent on tasks of your own, or draw it",
+    "replay": "a page that plays episodes of trained agents, with what they thought",
     "demo": "the paper's two motivating examples, trained and drawn",
     "reproduce": "the paper's figures, in a checkout of the project",
     "peers": "agents on formulas of others, beside published results, in a checkout",

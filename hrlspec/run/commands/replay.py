@@ -1,0 +1,173 @@
+"""Writes a page that plays episodes of trained agents: ``hrlspec replay --run DIR``, with ``--help`` for the flags.
+
+Exit status: 0 done, 2 bad usage or input.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+from tyro.conf import UseAppendAction
+
+from envs_jax import Environment
+from envs_jax.base import Layout
+from hrlspec.config import Checked, setting
+from hrlspec.evaluation import ltl_suite, suite_from_text
+from hrlspec.evaluation.recording import record_episodes
+from hrlspec.run import platform
+from hrlspec.run.commands.evaluate import load_params
+from hrlspec.run.console import result_console
+from hrlspec.run.errors import UserError
+from hrlspec.run.experiment import Experiment, experiment_of
+from hrlspec.run.flags import parse_flags
+from hrlspec.run.folder import check_writable, read_record
+from hrlspec.run.replay.data import Played, page_data
+from hrlspec.run.replay.page import page
+from hrlspec.spec import TaskTree, bare_lines
+from hrlspec.spec.automata import Automata
+
+MOST_AGENTS = 2
+
+
+@dataclasses.dataclass(frozen=True)
+class ReplayFlags(Checked):
+    """Writes a page that plays episodes of trained agents, with what the planner and the low level thought of them.
+
+    The page is one file, which needs neither a network nor a server.
+    """
+
+    run: UseAppendAction[tuple[Path, ...]]
+    """A run folder; a second --run is shown beside the first, in the same layouts."""
+    out: Path
+    """The page (.html)."""
+    spec: str | None = None
+    """A task in SPECTRL, such as "achieve a; (achieve b ensuring not c)"."""
+    ltl: str | None = None
+    """A task in linear temporal logic, such as "F (a & (!b U c))"."""
+    forever: bool = False
+    """Count how often the formula's accepting transitions are taken, instead of asking whether it is satisfied."""
+    episodes: int = setting(5, least=1, most=50)
+    """Each in a layout of its own."""
+    seed: int = setting(0, least=0, most=2**31 - 1)
+    """Of layouts and actions."""
+    greedy: bool = False
+    """Take the most likely action and sub-task instead of sampling."""
+    shield: bool = False
+    """Replace actions that would step on forbidden propositions."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Shown:
+    """An agent that is to be shown, not loaded yet."""
+
+    name: str
+    experiment: Experiment
+    folder: Path
+
+
+def main(argv: Sequence[str], *, program: str = "hrlspec replay") -> None:
+    """The command line.
+
+    Args:
+        argv: the arguments.
+        program: what to call it in messages.
+
+    Raises:
+        UserError: bad usage or input.
+        SpecError: the task cannot be read.
+        CheckpointError: there is no usable checkpoint.
+    """
+    flags = parse_flags(ReplayFlags, argv, program=program)
+    _check(flags)
+    agents = _agents(flags)
+    env = _common_world(agents)
+    formula, tasks = _task(flags, env)
+    platform.prepare()
+    keys = jax.random.split(jax.random.key(flags.seed), flags.episodes)
+    layouts = jax.tree.map(np.asarray, jax.vmap(env.sample_layout, (0, None))(keys, env.default_params))
+    played = [_play(agent, flags, tasks, layouts) for agent in agents]
+    text = page(page_data(env, formula, tasks, layouts, played))
+    flags.out.parent.mkdir(parents=True, exist_ok=True)
+    flags.out.write_text(text, encoding="utf-8", newline="\n")
+    size = len(text.encode()) / 1000
+    result_console().say(f"{flags.out}: {flags.episodes} episodes in {size:.0f} kB, to be opened in a browser")
+
+
+def _agents(flags: ReplayFlags) -> list[_Shown]:
+    """The agents that the flags name.
+
+    Raises:
+        UserError: there is none, or none that can be read.
+    """
+    names = [run.resolve().name for run in flags.run]
+    if len({*names}) < len(names):
+        names = [str(run) for run in flags.run]
+    return [
+        _Shown(name, experiment_of(read_record(run)["config"], str(run)), run)
+        for name, run in zip(names, flags.run, strict=True)
+    ]
+
+
+def _common_world(agents: Sequence[_Shown]) -> Environment:
+    """The world of all agents.
+
+    Raises:
+        UserError: it is not the same.
+    """
+    first, *others = agents
+    env = first.experiment.preset.make()
+    for other in others:
+        if other.experiment.preset.make() != env:
+            found = f"{first.name} is of {first.experiment.env}, {other.name} of {other.experiment.env}"
+            raise UserError(f"{found}; side by side they are shown in the same layouts, which takes the same world")
+    return env
+
+
+def _task(flags: ReplayFlags, env: Environment) -> tuple[str, TaskTree | Automata]:
+    """The task as it was written, and as it is carried out, with one row or as one automaton.
+
+    Raises:
+        SpecError: it cannot be read, or is too large.
+        UserError: there is more than one.
+    """
+    text = " ".join(bare_lines(flags.spec if flags.ltl is None else flags.ltl)).strip()
+    if flags.ltl is not None:
+        return text, ltl_suite("--ltl", text, env, forever=flags.forever).automata
+    return text, suite_from_text("--spec", text, env.propositions).trees
+
+
+def _play(shown: _Shown, flags: ReplayFlags, tasks: TaskTree | Automata, layouts: Layout) -> Played:
+    """Lets an agent carry out the task in each layout; the random numbers are the same for all agents."""
+    agent = shown.experiment.agent
+    params, _ = load_params(agent, shown.folder)
+    episodes, record = record_episodes(
+        jax.random.fold_in(jax.random.key(flags.seed), 1),
+        agent,
+        params,
+        shown.experiment.rewards,
+        tasks,
+        layouts,
+        which=np.zeros(flags.episodes, int),
+        greedy=flags.greedy,
+        shield=flags.shield,
+    )
+    return Played(shown.name, shown.experiment.method, *jax.device_get((episodes, record)))
+
+
+def _check(flags: ReplayFlags) -> None:
+    if (flags.spec is None) == (flags.ltl is None):
+        raise UserError(f"expected either --spec or --ltl, found {'neither' if flags.spec is None else 'both'}")
+    if flags.forever and flags.ltl is None:
+        raise UserError("--forever goes with --ltl")
+    if not 1 <= len(flags.run) <= MOST_AGENTS or len({*flags.run}) < len(flags.run):
+        found = " and ".join(map(str, flags.run)) or "none"
+        raise UserError(f"expected one --run, or two different ones, found {found}")
+    if flags.out.suffix != ".html":
+        raise UserError(f"--out {flags.out}: expected a file that ends in .html")
+    if flags.out.is_dir():
+        raise UserError(f"--out {flags.out}: expected a file, found a folder")
+    check_writable(flags.out.parent)
