@@ -148,14 +148,13 @@ def _deliberation(moment: Moment) -> Deliberation:
         return jax.nn.softmax(choice.logits), choice.value
 
     def alone(edge: Int32[Array, ""]) -> Float32[Array, " B"]:
-        others = open_now & (jnp.arange(num_nodes, dtype=jnp.int32) != edge)
         is_open = open_now[:, edge]
-        nothing = jnp.zeros(num_episodes, jnp.float32)
-        return jax.lax.cond(
-            is_open.any(),
-            lambda: jnp.where(is_open, choose(worker.task_state.blocked | others)[1], 0.0),
-            lambda: nothing,
-        )
+        others = open_now & (jnp.arange(num_nodes, dtype=jnp.int32) != edge)
+
+        def worth() -> Float32[Array, " B"]:
+            return jnp.where(is_open, choose(worker.task_state.blocked | others)[1], 0.0)
+
+        return jax.lax.cond(is_open.any(), worth, lambda: jnp.zeros(num_episodes, jnp.float32))
 
     def thoughts() -> Deliberation:
         probability, value = choose(worker.task_state.blocked)
