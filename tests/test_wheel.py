@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from hrlspec.presets import PRESETS
+from hrlspec.run.replay import page
 from hrlspec.version import __version__
 from tests.run import tiny
 
@@ -58,6 +59,8 @@ def test_what_is_inside(wheel: Path) -> None:
     for preset in PRESETS.values():
         files = {f"{name}.txt" for name in preset.suites} | {"reserved.hex"}
         assert {f"hrlspec/presets/suites/{preset.name}/{file}" for file in files} <= names
+    templates = {f"hrlspec/run/replay/{file}" for file in ("page.html", "page.css", *page.SCRIPTS)}
+    assert templates <= names
     assert "hrlspec = hrlspec.run.cli:console" in entry_points
     modules = {
         str(file.relative_to(ROOT)) for package in ("hrlspec", "envs_jax") for file in (ROOT / package).rglob("*.py")

@@ -123,6 +123,44 @@ def test_avoided_regions_and_headings_show() -> None:
     assert x.max() < 1.9
 
 
+@pytest.mark.parametrize("name", ["letter", "walk", "zone"])
+def test_an_outline_is_the_picture_upside_down(name: str) -> None:
+    """What is shown of a place in a frame is there in the outline, whose y points down as the rows of a frame do."""
+    env = envs_jax.make(name)
+    scene = scene_of(env)
+    outline = scene.outline()
+    assert {shape.name for shape in outline.shapes} == {*env.propositions}
+    empty = np.array([[0, 0]]) if name == "letter" else np.array([[scene.high, scene.high, 0.5]])
+    image = scene.frame(empty, 0, None)
+    height, width, _ = image.shape
+    for shape in outline.shapes:  # beside the middle, where the letter stands
+        x, y = shape.x + 0.8 * shape.radius, shape.y
+        seen = image[int(y * height / outline.height), int(x * width / outline.width)]
+        top = [some for some in outline.shapes if np.hypot(some.x - x, some.y - y) < some.radius]
+        assert seen.tolist() == pytest.approx(color_of(top[-1].name), abs=70)
+        assert shape.color in (None, color_of(shape.name))
+
+
+@pytest.mark.parametrize("name", ["letter", "walk", "flatworld", "zone"])
+def test_an_agent_lies_in_the_outline_where_it_lies_in_the_scene(name: str) -> None:
+    env = envs_jax.make(name)
+    scene = scene_of(env)
+    outline = scene.outline()
+    if isinstance(scene, GridScene):
+        places = np.argwhere(np.array(scene.cells) != "")
+        names = [scene.cells[row][column] for row, column in places]
+    else:
+        places = np.array([(region.x, region.y, 0.3) for region in scene.regions])
+        names = [region.name for region in scene.regions]
+    found = scene.in_outline(places)
+    assert [(shape.name, shape.x, shape.y) for shape in outline.shapes] == [
+        (name, x, y) for name, (x, y) in zip(names, found[:, :2].tolist(), strict=True)
+    ]
+    assert (found[:, 2:] == -0.3).all()  # which is counted the other way round
+    assert (found[:, :2] >= 0).all()
+    assert (found[:, :2] <= (outline.width, outline.height)).all()
+
+
 def test_which_region_of_a_name_was_reached() -> None:
     scene = scene_of(envs_jax.make("flatworld"))
     (reached,) = scene.index_at((0.5, -1.3), ("red", "blue"))

@@ -134,7 +134,7 @@ def _task(flags: ReplayFlags, env: Environment) -> tuple[str, TaskTree | Automat
         SpecError: it cannot be read, or is too large.
         UserError: there is more than one.
     """
-    text = " ".join(bare_lines(flags.spec if flags.ltl is None else flags.ltl)).strip()
+    text = " ".join(bare_lines(flags.ltl or flags.spec or "")).strip()
     if flags.ltl is not None:
         return text, ltl_suite("--ltl", text, env, forever=flags.forever).automata
     return text, suite_from_text("--spec", text, env.propositions).trees

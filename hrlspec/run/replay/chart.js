@@ -23,7 +23,8 @@ function drawChart(episode, length, bounds, seek) {
   if (episode.rewards.length) {
     row("reward", "strip", ...episode.rewards.map(([step, reward]) => html("span", { class: step + 1 > 0.9 * length ? "gain left" : "gain", style: `left:${share(step + 1)}` }, `▲${reward > 0 ? "+" : ""}${reward}`)));
   }
-  row("sub-task", "tall", ...legsOf(episode).filter(({ edge }) => edge).map(({ first, end, task, edge }) => {
+  const legs = legsOf(episode).filter(({ edge }) => edge);
+  if (legs.length) row("sub-task", "tall", ...legs.map(({ first, end, task, edge }) => {
     const text = subtask(RECORD.tasks[task], edge);
     return html("span", { class: "leg", style: `left:${share(first)};width:${share(end - first)}`, title: text }, text);
   }));

@@ -12,8 +12,10 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Bool
 
 from envs_jax import Drawable, Environment
+from envs_jax.arrays import Array
 from envs_jax.base import Layout
 from envs_jax.scenes import Scene
 from hrlspec.evaluation.episodes import Episodes
@@ -58,13 +60,13 @@ def page_data(
     num_layouts = len(jax.tree.leaves(layouts)[0])
     each = [jax.tree.map(lambda x, i=i: x[i], layouts) for i in range(num_layouts)]
     scenes = [env.scene(layout) if isinstance(env, Drawable) else None for layout in each]
-    is_tree = not isinstance(tasks, Automata)
-    trees = jax.tree.map(np.asarray, tasks if isinstance(tasks, TaskTree) else tasks.trees)
-    runs = [
+    automata = tasks if isinstance(tasks, Automata) else None
+    trees = jax.tree.map(np.asarray, tasks.trees if isinstance(tasks, Automata) else tasks)
+    runs: list[Json] = [
         {
             "name": some.name,
             "method": some.method,
-            "episodes": [_episode(some, i, scene, one_task=is_tree) for i, scene in enumerate(scenes)],
+            "episodes": [_episode(some, i, scene, one_task=automata is None) for i, scene in enumerate(scenes)],
         }
         for some in played
     ]
@@ -74,7 +76,7 @@ def page_data(
         "formula": formula,
         "names": names,
         "tasks": {row: _tree(jax.tree.map(lambda x, row=row: x[row], trees)) for row in sorted(visited)},
-        "automaton": None if is_tree else _automaton(tasks, names),
+        "automaton": None if automata is None else _automaton(automata, names),
         "scenes": [_scene(scene) for scene in scenes],
         "runs": runs,
     }
@@ -94,7 +96,7 @@ def _episode(played: Played, index: int, scene: Scene | None, *, one_task: bool)
         "rounds": int(ended.rounds),
         "return": _rounded(ended.returns),
         "steps": steps,
-        "places": _places(whole.position, scene),
+        "places": _places(np.asarray(whole.position), scene),
         "labels": _changes([_members(row)] for row in whole.labels),
         "standing": _changes(
             [int(row), int(node), _members(blocked)]
@@ -178,7 +180,7 @@ def _changes(rows: Iterable[list[Any]]) -> list[list[Any]]:
     return found
 
 
-def _members(row: np.ndarray) -> list[int]:
+def _members(row: Bool[Array, " _"]) -> list[int]:
     return np.flatnonzero(row).tolist()
 
 

@@ -17,14 +17,14 @@ function makePanel(run, number, episodeNumber, length, bounds, seek) {
   const trees = {};
   let tree = null;
 
-  const node = html("article", { class: "panel", "aria-labelledby": identity },
+  const node = html("article", { class: world ? "panel" : "panel unseen", "aria-labelledby": identity },
     html("header", { class: "head" },
       html("h2", { id: identity }, run.name, html("span", {}, ` · ${run.method}`)),
       html("p", { class: "outcome number" }, html("b", {}, outcomeOf(episode)), ` · ${plural(episode.steps, "step")} · return ${episode.return}`)),
     now,
     world && html("div", { class: "world" }, world.node),
     side,
-    html("section", { class: "chart" }, html("h3", {}, "Low level’s value; ○ the planner’s, where it decides"), chart.node),
+    html("section", { class: "chart" }, html("h3", {}, `Low level’s value${episode.decisions.length ? "; ○ the planner’s, where it decides" : ""}`), chart.node),
     html("details", { class: "log" }, html("summary", {}, "What happened"), log.node));
 
   return {

@@ -8,30 +8,30 @@ function drawWorld(scene, episode, name) {
   const thin = width / 400;
   const margin = cell ? 0 : width * 0.02;
   const box = `${-margin} ${-margin} ${width + 2 * margin} ${height + 2 * margin}`;
-  const picture = svg("svg", { class: "map", viewBox: box, role: "img" });
+  const picture = svg("svg", { class: "map", viewBox: box, role: "img", style: `--ratio:${width / height}` });
   picture.append(hatching(name, thin));
   if (cell) picture.append(gridLines(width, height, cell, thin));
-  const shapes = scene.shapes.map((shape) => ({ shape, node: drawShape(shape, name, thin) }));
+  const marks = scene.shapes.map((shape) => ({ shape, node: drawMarks(shape, name, thin) }));
   const toCome = svg("path", { class: "trail to-come", "stroke-width": 2 * thin, d: route(xs, ys, 0, episode.steps, cell) });
   const been = svg("path", { class: "trail been", "stroke-width": 2.4 * thin });
   const done = svg("g");
   const agent = drawAgent(cell ? cell * CELL_AGENT : width * FREE_AGENT, thin, Boolean(cell), Boolean(headings));
-  picture.append(...shapes.map(({ node }) => node), toCome, been, ...scene.shapes.map(drawName).filter(Boolean), agent, done);
-  const marks = completed(episode).map((step, number) => [step, markDone(xs[step], ys[step], number + 1, (cell ?? width / 9) * 0.17, thin, cell)]);
+  picture.append(...scene.shapes.map((shape) => drawShape(shape, thin)), ...marks.map(({ node }) => node), toCome, been, ...scene.shapes.map((shape) => drawName(shape, thin)), agent, done);
+  const numbers = completed(episode).map((step, number) => [step, markDone(xs[step], ys[step], number + 1, (cell ?? width / 9) * 0.17, thin, cell)]);
 
   return {
     node: picture,
     show(moment) {
       const here = namesOf(moment.reach);
       const shunned = namesOf(moment.avoid);
-      for (const { shape, node } of shapes) {
+      for (const { shape, node } of marks) {
         node.classList.toggle("reach", here.includes(shape.name));
         node.classList.toggle("avoid", shunned.includes(shape.name));
       }
       been.setAttribute("d", route(xs, ys, 0, moment.now, cell));
       const turn = headings ? ` rotate(${(headings[moment.now] * 180) / Math.PI})` : "";
       agent.setAttribute("transform", `translate(${xs[moment.now]} ${ys[moment.now]})${turn}`);
-      done.replaceChildren(...marks.filter(([step]) => step <= moment.now).map(([, mark]) => mark));
+      done.replaceChildren(...numbers.filter(([step]) => step <= moment.now).map(([, node]) => node));
       picture.setAttribute("aria-label", `The world from above. ${spoken(episode, moment)}`);
     },
   };
@@ -73,23 +73,32 @@ function hatching(name, thin) {
       svg("path", { class: "hatching", d: `M${size / 2} 0V${size}`, "stroke-width": 1.6 * thin })));
 }
 
-// A region or a cell; classes reach and avoid switch its marks on.
-function drawShape({ kind, name, x, y, radius, color }, owner, thin) {
-  const inset = kind === "disc" ? 0 : radius * 0.06;
-  const r = radius - inset;
-  const body = (attributes) => kind === "disc"
+// A region, a cell or a wall as an element with other attributes.
+function formOf({ kind, x, y, radius }, attributes) {
+  const r = kind === "cell" ? 0.94 * radius : radius;
+  return kind === "disc"
     ? svg("circle", { cx: x, cy: y, r, ...attributes })
-    : svg("rect", { x: x - r, y: y - r, width: 2 * r, height: 2 * r, rx: kind === "wall" ? 0 : r * 0.14, ...attributes });
-  if (kind === "wall") return svg("rect", { class: "wall", x: x - radius, y: y - radius, width: 2 * radius, height: 2 * radius });
-  const corner = r * (kind === "disc" ? 0.7 : 0.74);
-  const badge = 0.2 * radius;
+    : svg("rect", { x: x - r, y: y - r, width: 2 * r, height: 2 * r, rx: kind === "cell" ? 0.13 * r : 0, ...attributes });
+}
+
+function drawShape(shape, thin) {
+  if (shape.kind === "wall") return svg("g", {}, formOf(shape, { class: "wall" }));
+  return svg("g", {},
+    formOf(shape, { class: "place", "stroke-width": thin }),
+    shape.color && formOf(shape, { class: "tint", fill: `rgb(${shape.color})` }));
+}
+
+// What classes reach and avoid switch on: rim, hatching and a badge, above all shapes.
+function drawMarks(shape, owner, thin) {
+  const { kind, x, y, radius } = shape;
+  const corner = radius * 0.7;
+  const badge = Math.min(0.2 * radius, 11 * thin);
   const arm = 0.5 * badge;
   const line = { "stroke-width": 0.26 * badge };
+  if (kind === "wall") return svg("g");
   return svg("g", {},
-    body({ class: "place", "stroke-width": thin }),
-    color && body({ class: "tint", fill: `rgb(${color})` }),
-    body({ class: "hatch", fill: `url(#hatch-${owner})` }),
-    body({ class: "rim", "stroke-width": 4 * thin }),
+    formOf(shape, { class: "hatch", fill: `url(#hatch-${owner})` }),
+    formOf(shape, { class: "rim", "stroke-width": 4 * thin }),
     svg("g", { class: "badge", transform: `translate(${x + corner} ${y - corner})` },
       svg("circle", { r: badge, ...line }),
       svg("circle", { class: "aim", r: 0.3 * badge, ...line }),
@@ -97,9 +106,9 @@ function drawShape({ kind, name, x, y, radius, color }, owner, thin) {
 }
 
 // Above the way of the agent.
-function drawName({ kind, name, x, y, radius }) {
-  const size = Math.min(kind === "disc" ? 0.62 * radius : 0.8 * radius, (2.9 * radius) / name.length);
-  return name && svg("text", { class: "name", x, y, "font-size": size, "stroke-width": size * 0.2 }, name);
+function drawName({ kind, name, x, y, radius }, thin) {
+  const size = Math.min(kind === "disc" ? 0.62 * radius : 0.8 * radius, (2.9 * radius) / name.length, 24 * thin);
+  return svg("text", { class: "name", x, y, "font-size": size, "stroke-width": size * 0.2 }, name);
 }
 
 function drawAgent(radius, thin, onGrid, turns) {
