@@ -17,6 +17,7 @@ from hrlspec.evaluation.protocol import (
     periodic_evaluation,
     return_evaluation,
 )
+from hrlspec.evaluation.recording import Record, record_episodes
 from hrlspec.evaluation.results import ChoiceResult, ReturnResult, Score, SuiteResult, TaskScore
 from hrlspec.evaluation.suite import Suite, suite_from_text, suite_from_trees
 
@@ -32,6 +33,7 @@ __all__ = [
     "FormulaScore",
     "LtlResult",
     "LtlSuite",
+    "Record",
     "ReturnEvaluation",
     "ReturnResult",
     "Score",
@@ -50,6 +52,7 @@ __all__ = [
     "make_branch_cases",
     "make_cases",
     "periodic_evaluation",
+    "record_episodes",
     "return_evaluation",
     "run_episodes",
     "suite_from_text",

@@ -16,8 +16,7 @@ from tyro.conf import UseAppendAction
 from envs_jax import Environment
 from envs_jax.base import Layout
 from hrlspec.config import Checked, setting
-from hrlspec.evaluation import ltl_suite, suite_from_text
-from hrlspec.evaluation.recording import record_episodes
+from hrlspec.evaluation import ltl_suite, record_episodes, suite_from_text
 from hrlspec.run import platform
 from hrlspec.run.commands.evaluate import load_params
 from hrlspec.run.console import result_console
