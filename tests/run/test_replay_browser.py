@@ -120,6 +120,19 @@ def test_it_shows_what_was_recorded(visit: Visit) -> None:
             check(visit, episode, step)
 
 
+def test_the_list_of_what_happened_leads_there(visit: Visit) -> None:
+    panel, episode = visit.panels[0], visit.data["runs"][0]["episodes"][0]
+    panel.locator(".log summary").click()
+    entries = panel.locator(".log button").all()
+    said = [entry.text_content() for entry in entries]
+    assert said[0].startswith("Step 0the planner assigns ")
+    assert said[-1] == f"Step {episode['steps']}the episode ends: {episode['outcome']}"
+    first = next(i for i, text in enumerate(said) if text.endswith("is reached"))
+    assert "the planner assigns" in said[first + 1]  # then the next sub-task
+    entries[first].click()
+    check(visit, 0, episode["standing"][1][0])
+
+
 def test_it_plays_to_the_end_and_is_scrubbed_back(visit: Visit) -> None:
     length = max(run["episodes"][0]["steps"] for run in visit.data["runs"])
     visit.tab.locator("#speed").select_option("200")

@@ -23,9 +23,9 @@ function drawTree(tree) {
     row[node] = children.length ? (row[children[0]] + row[children.at(-1)]) / 2 : leaves++;
   };
   place(ROOT, 0);
-  const left = (node) => (node === ROOT ? 4 : 4 + 34 + across * (depth[node] - 1) + 28);
+  const left = (node) => 66 + across * (depth[node] - 1);
   const middle = (node) => 6 + down * row[node] + height / 2;
-  const total = [left(ROOT) + 62 + across * Math.max(...depth), 12 + down * leaves - 12];
+  const total = [66 + across * Math.max(...depth), down * leaves];
   const picture = svg("svg", { class: "graph", width: total[0], height: total[1], viewBox: `0 0 ${total.join(" ")}`, role: "img" });
   const groups = boxes.map(({ reach, avoid }, edge) => {
     if (edge === ROOT) return svg("g", {}, svg("circle", { class: "box", cx: 17, cy: middle(ROOT), r: 11 }));

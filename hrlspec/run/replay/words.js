@@ -16,27 +16,26 @@ function outcomeOf(episode) {
   return `${SIGNS[episode.outcome] ?? "◦"} ${how}`;
 }
 
-// What happened, and when: [step, words].
+// What happened, and when: [step, words]. In one step, what was reached comes before what is assigned next.
 function eventsOf(episode) {
-  const events = episode.decisions.map((some) => {
-    const { tree, edge } = momentOf(episode, some.step);
-    const branch = some.branches.find(([child]) => child === edge);
-    const odds = some.branches.length > 1 && branch ? ` (${percent(branch[1])})` : "";
-    return [some.step, `the planner chooses ${subtask(tree, edge)}${odds}`];
-  });
+  const events = [];
   episode.standing.forEach(([step, task, node, blocked], number) => {
     if (!number) return;
     const [, before, from, shut] = episode.standing[number - 1];
     const tree = RECORD.tasks[task];
     if (task !== before) events.push([step, `the automaton moves to state ${task}`]);
     else if (node !== from) events.push([step, `${namesOf(tree.reach[node]).join(" and ")} is reached`]);
-    for (const edge of blocked.filter((some) => task === before && node === from && !shut.includes(some))) {
-      events.push([step, `the branch to ${namesOf(tree.reach[edge]).join(" and ")} is blocked`]);
-    }
+    else for (const edge of blocked.filter((some) => !shut.includes(some))) events.push([step, `the branch to ${subtask(tree, edge)} is blocked`]);
   });
   for (const [step, reward] of episode.rewards) events.push([step + 1, `reward ${reward}`]);
+  for (const { step, branches } of episode.decisions) {
+    const { tree, edge } = momentOf(episode, step);
+    const branch = branches.find(([child]) => child === edge);
+    const odds = branches.length > 1 && branch ? ` (${percent(branch[1])})` : "";
+    events.push([step, `the planner assigns ${subtask(tree, edge)}${odds}`]);
+  }
   events.push([episode.steps, `the episode ends: ${outcomeOf(episode).slice(2)}`]);
-  return events.map((event, order) => [...event, order]).sort((a, b) => a[0] - b[0] || a[2] - b[2]);
+  return events.sort((a, b) => a[0] - b[0]); // which keeps the order within a step
 }
 
 function spoken(episode, moment) {
