@@ -61,7 +61,7 @@ def test_what_is_recorded_is_what_happens(name: str) -> None:
         task = initial(tree)
         for t in range(steps):
             before, after = (jax.tree.map(lambda x, t=t, i=i: x[t, i], x) for x in (record.before, record.after))
-            np.testing.assert_array_equal(before.position, env.position(state))
+            np.testing.assert_allclose(before.position, env.position(state), atol=1e-6)
             np.testing.assert_array_equal(before.labels, env.labels(state, params))
             assert int(before.state.node) == int(task.node)
             _, state, *_ = step(KEY, state, record.action[t, i], params)

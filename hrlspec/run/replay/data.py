@@ -20,7 +20,7 @@ from envs_jax.base import Layout
 from envs_jax.scenes import Scene
 from hrlspec.evaluation.episodes import Episodes
 from hrlspec.evaluation.recording import Record, Standing
-from hrlspec.spec import SATISFIED, VIOLATED, TaskTree, subtask_avoid
+from hrlspec.spec import RUNNING, SATISFIED, VIOLATED, TaskTree, subtask_avoid
 from hrlspec.spec.automata import Automata
 from hrlspec.spec.ltl.guards import guards
 
@@ -150,23 +150,28 @@ def _tree(tree: TaskTree) -> Json:
 
 
 def _automaton(automata: Automata, names: Sequence[str]) -> Json:
-    """States and the moves between them, each with its condition; of moves to the state itself those that accept."""
+    """The states that can be reached, and the moves between them, each with its condition.
+
+    Of moves from a state to itself those that accept.
+    """
     column = np.asarray(automata.column)
     labels = np.flatnonzero(column >= 0)
     holds = (labels[:, None] >> np.arange(len(names)) & 1).astype(bool)
-    moves = []
-    for state, status in enumerate(np.asarray(automata.status).tolist()):
-        if status in (SATISFIED, VIOLATED):
+    status, successors, accepts = map(np.asarray, (automata.status, automata.successors, automata.accepts))
+    moves, states = [], [int(automata.start[0])]
+    for state in states:  # grows while it is read
+        if status[state] != RUNNING:
             continue
-        target = np.asarray(automata.successors)[state, column[labels]]
-        accepts = np.asarray(automata.accepts)[state, column[labels]]
-        for code, text in guards(holds, 2 * target + accepts, names).items():
-            if code != 2 * state:
-                moves.append({"from": state, "to": code // 2, "if": text, "accepts": bool(code % 2)})
+        at = state, column[labels]
+        for code, text in guards(holds, 2 * successors[at] + accepts[at], names).items():
+            target, accepting = code // 2, bool(code % 2)
+            if target not in states:
+                states.append(target)
+            if target != state or accepting:
+                moves.append({"from": state, "to": target, "if": text, "accepts": accepting})
     return {
-        "satisfied": _members(np.asarray(automata.status) == SATISFIED),
-        "violated": _members(np.asarray(automata.status) == VIOLATED),
-        "num_states": len(automata.status),
+        "satisfied": [state for state in states if status[state] == SATISFIED],
+        "violated": [state for state in states if status[state] == VIOLATED],
         "moves": moves,
     }
 
