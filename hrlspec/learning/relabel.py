@@ -218,8 +218,9 @@ def _grow(
     longest = branch_lengths(max_path, max_nodes)
     rounds = max(1, *longest)  # One at least, so that there is something to gather nothing from where no branch fits.
     num_places = int(longest.sum())
-    shapes = ((2, max_path), (rounds, max_path, num_propositions), (num_places, num_propositions + 1))
-    shapes += ((max_path * ensuring, num_propositions + 1),)
+    width = num_propositions + 1
+    path_places = max_path if ensuring else 0
+    shapes = ((2, max_path), (rounds, max_path, num_propositions), (num_places, width), (path_places, width))
     sizes = [math.prod(shape) for shape in shapes]
     # One draw for everything: each takes longer to compile than what is done with it.
     drawn = jnp.split(jax.random.uniform(key, (sum(sizes),), jnp.float32), np.cumsum(sizes)[:-1])

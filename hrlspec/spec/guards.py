@@ -8,13 +8,16 @@ Sets of propositions are integers here, bit i standing for the i-th name in alph
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
-from typing import NamedTuple
+import functools
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
 
 from hrlspec.spec.ltl.automaton import Automaton
+
+Place = TypeVar("Place")
 
 
 class Transition(NamedTuple):
@@ -42,34 +45,47 @@ class _Cube(NamedTuple):
 
 def transitions(automaton: Automaton) -> list[Transition]:
     """State by state; accepting transitions apart from others between the same states."""
-    names = sorted(frozenset().union(*automaton.labels))
-    codes = [sum(1 << names.index(name) for name in label) for label in automaton.labels]
     marks = np.zeros_like(automaton.successors) if automaton.marks is None else automaton.marks
-    known: dict[tuple[frozenset[int], frozenset[int]], str] = {}  # states have many guards in common
     found = []
     for state in range(automaton.num_states):
         goes = {
-            code: (int(target), bool(marked))
-            for code, target, marked in zip(codes, automaton.successors[state], marks[state], strict=True)
+            label: (int(target), bool(marked))
+            for label, target, marked in zip(automaton.labels, automaton.successors[state], marks[state], strict=True)
         }
-        for bit in (1 << i for i in range(len(names))):
-            if all(goes.get(code ^ bit) == where for code, where in goes.items()):  # it makes no difference
-                goes = {code: where for code, where in goes.items() if not code & bit}
-        for target, accepting in dict.fromkeys(goes.values()):
-            on = frozenset(code for code, where in goes.items() if where == (target, accepting))
-            off = frozenset(goes) - on
-            if (on, off) not in known:
-                known[on, off] = _text(_cover(on, off), names)
-            found.append(Transition(state, target, accepting, known[on, off]))
+        found += [Transition(state, *place, guard) for place, guard in guards(goes).items()]
     return found
 
 
-def _text(cubes: Iterable[_Cube], names: Sequence[str]) -> str:
+def guards(goes: Mapping[frozenset[str], Place]) -> dict[Place, str]:
+    """When each place comes next, in the syntax of LTL.
+
+    Args:
+        goes: where each label that can occur leads.
+    """
+    names = tuple(sorted(frozenset().union(*goes)))
+    leads = {sum(1 << names.index(name) for name in label): place for label, place in goes.items()}
+    for bit in (1 << i for i in range(len(names))):
+        if all(leads.get(code ^ bit) == place for code, place in leads.items()):  # it makes no difference
+            leads = {code: place for code, place in leads.items() if not code & bit}
+    return {
+        place: _text(
+            frozenset(code for code, other in leads.items() if other == place),
+            frozenset(code for code, other in leads.items() if other != place),
+            names,
+        )
+        for place in dict.fromkeys(leads.values())
+    }
+
+
+@functools.lru_cache(maxsize=1024)  # states have many guards in common
+def _text(on: frozenset[int], off: frozenset[int], names: Sequence[str]) -> str:
+    """A guard of the labels ``on`` and of none of ``off``."""
+
     def conjunction(cube: _Cube) -> str:
         named = ((i, name) for i, name in enumerate(names) if cube.named >> i & 1)
         return " & ".join(name if cube.holding >> i & 1 else f"!{name}" for i, name in named)
 
-    return " | ".join(map(conjunction, cubes)) or "true"
+    return " | ".join(map(conjunction, _cover(on, off))) or "true"
 
 
 def _cover(on: Collection[int], off: Collection[int]) -> list[_Cube]:

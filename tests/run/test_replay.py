@@ -75,7 +75,7 @@ def test_an_automaton_comes_with_its_moves_and_the_trees_of_the_states_that_were
         for t, (here, there) in enumerate(itertools.pairwise(seen)):
             if here != there:  # the condition of the move holds, in a world of one letter at a time
                 (label,) = np.flatnonzero(some.record.after.labels[t, i])
-                assert LETTER.propositions[label] in where[here, there].split(" or ")
+                assert LETTER.propositions[label] in where[here, there].split(" | ")
         assert {*seen} <= {*data["tasks"]}
     assert len(automaton["satisfied"]) == len(automaton["violated"]) == 1
 

@@ -22,7 +22,7 @@ from hrlspec.evaluation.episodes import Episodes
 from hrlspec.evaluation.recording import Record, Standing
 from hrlspec.spec import RUNNING, SATISFIED, VIOLATED, TaskTree, subtask_avoid
 from hrlspec.spec.automata import Automata
-from hrlspec.spec.ltl.guards import guards
+from hrlspec.spec.guards import guards
 
 Json = dict[str, Any]
 
@@ -155,16 +155,17 @@ def _automaton(automata: Automata, names: Sequence[str]) -> Json:
     Of moves from a state to itself those that accept.
     """
     column = np.asarray(automata.column)
-    labels = np.flatnonzero(column >= 0)
-    holds = (labels[:, None] >> np.arange(len(names)) & 1).astype(bool)
+    labels = {
+        frozenset(name for i, name in enumerate(names) if code >> i & 1): int(column[code])
+        for code in np.flatnonzero(column >= 0).tolist()
+    }
     status, successors, accepts = map(np.asarray, (automata.status, automata.successors, automata.accepts))
     moves, states = [], [int(automata.start[0])]
     for state in states:  # grows while it is read
         if status[state] != RUNNING:
             continue
-        at = state, column[labels]
-        for code, text in guards(holds, 2 * successors[at] + accepts[at], names).items():
-            target, accepting = code // 2, bool(code % 2)
+        goes = {label: (int(successors[state, at]), bool(accepts[state, at])) for label, at in labels.items()}
+        for (target, accepting), text in guards(goes).items():
             if target not in states:
                 states.append(target)
             if target != state or accepting:
