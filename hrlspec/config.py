@@ -309,6 +309,45 @@ def evolve(settings: S, changes: Mapping[str, Any]) -> S:
     return dataclasses.replace(settings, **values)  # type: ignore[type-var]
 
 
+def from_plain(example: S, data: Any, *, prefix: str = "") -> S:
+    """Settings from plain JSON values, as a record has them; lists become tuples.
+
+    Args:
+        example: settings of the same type, all the way down.
+        data: a value for each of the settings, under its name.
+        prefix: of their names in messages, with its dot.
+
+    Raises:
+        ConfigError: settings are missing or unknown, or a value is of another type or out of its range.
+    """
+    fields = {field.name: getattr(example, field.name) for field in dataclasses.fields(example)}  # type: ignore[arg-type]
+    if not isinstance(data, Mapping) or data.keys() != fields.keys():
+        found = set(data) if isinstance(data, Mapping) else set()
+        raise ConfigError(f"the setting {prefix + min(found ^ fields.keys(), default='')!r} is not in both")
+    hints = typing.get_type_hints(type(example))
+    return type(example)(
+        **{
+            name: from_plain(value, data[name], prefix=f"{prefix}{name}.")
+            if dataclasses.is_dataclass(value)
+            else _from_plain(hints[name], data[name], prefix + name)
+            for name, value in fields.items()
+        }
+    )
+
+
+def _from_plain(kind: Any, value: Any, name: str) -> Any:
+    """A value of an annotated type from a plain JSON value."""
+    origin, options = typing.get_origin(kind), typing.get_args(kind)
+    if origin is tuple and isinstance(value, list):
+        return tuple(_from_plain(options[0], item, name) for item in value)
+    if not _fits(value, kind):
+        raise ConfigError(f"{name} is {value!r}")
+    try:
+        return float(value) if kind is float else value
+    except OverflowError:
+        raise ConfigError(f"{name} is too large") from None
+
+
 def without_copies(config: Config) -> Config:
     """No relabelled copies; minibatches as large as with them, if the environments divide into such."""
     rows, minibatches = config.envs_per_block + config.copies_per_block, config.low.optimiser.minibatches

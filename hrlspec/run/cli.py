@@ -18,12 +18,14 @@ from hrlspec.version import __version__
 COMMANDS = {
     "run": "train an agent, evaluate it on unseen tasks, draw what it does",
     "evaluate": "evaluate a trained agent on tasks of your own, or draw it",
+    "export": "an agent as a file of parameters and a card that says what it is",
     "demo": "the paper's two motivating examples, trained and drawn",
     "reproduce": "the paper's figures, in a checkout of the project",
     "peers": "agents on formulas of others, beside published results, in a checkout",
+    "pretrain": "the agents that come along, trained anew, in a checkout of the project",
     "suites": "draw the test suites anew, or check them",
 }
-_IN_CHECKOUT = ("reproduce", "peers")
+_IN_CHECKOUT = ("reproduce", "peers", "pretrain")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
