@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import os
 from collections.abc import Mapping
@@ -25,7 +26,7 @@ from hrlspec.tasks.rewards import RewardMachine
 PACKAGED = Path(__file__).parent / "packaged"
 """The agents that come along."""
 _LARGEST = 2**28  # bytes
-_DEEPEST = 256  # layers or rounds, each of which is traced
+_DEEPEST, _WIDEST = 256, 65_536  # layers or rounds, each of which is traced, and features
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,7 +191,7 @@ def _origin(record: Mapping[str, Any]) -> _Origin:
 
 
 def _check_size(settings: Any, name: str) -> None:
-    """Refuses networks that would take for ever to set up: what is long, and rounds that are many.
+    """Refuses networks that would take for ever to set up: what is long, wide, or has many rounds.
 
     Raises:
         ConfigError: naming the setting.
@@ -198,10 +199,13 @@ def _check_size(settings: Any, name: str) -> None:
     if isinstance(settings, Mapping):
         for inner, value in settings.items():
             _check_size(value, f"{name}.{inner}".lstrip("."))
-    rounds = name.rpartition(".")[2] in ("rounds", "task_rounds", "lookahead", "memory")
-    size = len(settings) if isinstance(settings, list) else settings if rounds else 0
-    if isinstance(size, int) and size > _DEEPEST:
-        raise ConfigError(f"the setting {name} asks for {size} layers or rounds, expected {_DEEPEST} at most")
+        return
+    several = settings if isinstance(settings, list) else [settings]
+    of_networks = [value for value in several if isinstance(value, int) and ".network." in name]
+    most = _DEEPEST if name.endswith(("rounds", "lookahead", "memory")) else _WIDEST
+    for size, limit in ((len(several), _DEEPEST), (max(of_networks, default=0), most)):
+        if size > limit:
+            raise ConfigError(f"the setting {name} asks for {size}, expected {limit} at most")
 
 
 def _library() -> Any:
@@ -217,8 +221,9 @@ def _library() -> Any:
     return safetensors
 
 
+@functools.cache
 def _shapes(agent: Agent) -> Params:
-    """Shapes and types of what acting needs."""
+    """Shapes and types of what acting needs; not to be changed."""
     shapes: Params = agent.acting(jax.eval_shape(agent.init, jax.random.key(0)))
     return shapes
 
