@@ -7,7 +7,7 @@ looked up by name among the library's own, and what does not fit is refused in o
 from __future__ import annotations
 
 from hrlspec.agent_files.card import FORMAT, AgentFileError, Card
-from hrlspec.agent_files.files import PACKAGED, AgentFile, packaged_agents, read_agent, read_params, write_agent
+from hrlspec.agent_files.files import PACKAGED, AgentFile, acts, packaged_agents, read_agent, read_params, write_agent
 
 __all__ = [
     "FORMAT",
@@ -15,6 +15,7 @@ __all__ = [
     "AgentFile",
     "AgentFileError",
     "Card",
+    "acts",
     "packaged_agents",
     "read_agent",
     "read_params",

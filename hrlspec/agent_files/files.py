@@ -26,6 +26,7 @@ from hrlspec.tasks.rewards import RewardMachine
 PACKAGED = Path(__file__).parent / "packaged"
 """The agents that come along."""
 _LARGEST = 2**28  # bytes
+_TRAINING = {"begun_from", "curriculum", "evaluation", "low", "optimiser", "ppo", "relabel"}
 _DEEPEST, _WIDEST = 256, 65_536  # layers or rounds, each of which is traced, and features
 
 
@@ -53,6 +54,11 @@ class AgentFile:
     def rewards(self) -> RewardMachine:
         """The rewards that it was trained with."""
         return self.preset.rewards(self.reward_set)
+
+
+def acts(name: str) -> bool:
+    """Whether the setting of a dotted name tells how an agent acts, and not only how it is trained."""
+    return _TRAINING.isdisjoint(name.split("."))
 
 
 def packaged_agents() -> tuple[str, ...]:
@@ -185,9 +191,8 @@ def _origin(record: Mapping[str, Any]) -> _Origin:
     if not isinstance(method, str) or method not in METHODS:
         raise ConfigError(f"it is of the method {method!r}, which is none of hrlspec's")
     _check_size(record, "")
-    other = {"evaluation", "begun_from"}  # they do not make the agent
     example = _Origin("", "", "hrlspec", 1, 0, Config(), METHODS[method])
-    return from_plain(example, {name: value for name, value in record.items() if name not in other})
+    return from_plain(example, {name: value for name, value in record.items() if acts(name)}, needed=acts)
 
 
 def _check_size(settings: Any, name: str) -> None:

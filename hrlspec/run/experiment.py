@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from hrlspec.agent.agent import Agent
+from hrlspec.agent_files import acts
 from hrlspec.config import Checked, Config, ConfigError, from_plain, setting
 from hrlspec.methods import Method
 from hrlspec.presets import Preset, Recipe, RewardSet, Split
@@ -105,8 +106,14 @@ class Experiment:
         return self.preset.rewards(self.reward_set)
 
 
-def experiment_of(record: Mapping[str, Any], where: str) -> Experiment:
+def experiment_of(record: Mapping[str, Any], where: str, *, to_act: bool = False) -> Experiment:
     """The experiment in ``config.json``'s ``config``.
+
+    Args:
+        record: its entries.
+        where: what to call it in messages.
+        to_act: whether it is wanted for an agent to act. Settings that training alone heeds may then be missing, as
+            where they came later, and have their defaults.
 
     Raises:
         UserError: the record is of a version with other settings, or its environment or method is not to be had.
@@ -119,6 +126,6 @@ def experiment_of(record: Mapping[str, Any], where: str) -> Experiment:
     example = Experiment("", "", "hrlspec", 1, 0, EvaluationConfig(), Config(), method)
     try:
         # Before training could begin from given parameters, every run began afresh.
-        return from_plain(example, {"begun_from": None, **record})
+        return from_plain(example, {"begun_from": None, **record}, needed=acts if to_act else lambda _: True)
     except ConfigError as error:
         raise UserError(f"{where} was made by another version of hrlspec: {error}") from None

@@ -108,7 +108,7 @@ def _in_file(name: str) -> Source:
 
 
 def _in_run(run: Path, step: int | None) -> Source:
-    experiment = experiment_of(read_record(run)["config"], str(run))
+    experiment = experiment_of(read_record(run)["config"], str(run), to_act=True)
 
     def load() -> tuple[TrainedAgent, dict[str, Any]]:
         agent = experiment.agent

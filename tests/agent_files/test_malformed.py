@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from hrlspec.agent_files import AgentFileError, read_agent, read_params
+from hrlspec.config import Config
 from hrlspec.run.commands import evaluate, run
 from hrlspec.run.errors import main_guard
 from tests.agent_files.made import Draft, write_tiny
@@ -152,8 +153,8 @@ MALFORMED: dict[str, tuple[Change, str]] = {
     "unknown recipe": (setting("recipe", "secret"), "recipe is 'secret'"),
     "unknown reward set": (setting("reward_set", 3), "reward_set is 3"),
     "unknown setting": (setting("config.network.magic", 1), "the setting 'config.network.magic' is not in both"),
-    "a setting is missing": (setting(RATE, ...), f"the setting {RATE!r} is not in both"),
-    "settings are a number": (setting("config.network", 7), "the setting 'config.network."),
+    "a setting is missing": (setting(LATENT, ...), f"the setting {LATENT!r} is not in both"),
+    "settings are a number": (setting("config.network", 7), "config.network is 7"),
     "a setting as text": (setting(LATENT, "8"), f"{LATENT} is '8'"),
     "a setting as truth": (setting(LATENT, True), f"{LATENT} is True"),
     "a setting out of range": (setting(LATENT, -1), "latent is -1, expected at least 1"),
@@ -259,6 +260,16 @@ def test_a_draft_that_is_not_changed_is_accepted(draft: Draft) -> None:
     file = read_agent(draft.card_file)
     assert read_params(file).keys() == {"low", "high"}
     assert read_agent(draft.file) == file
+
+
+def test_settings_of_training_may_be_missing(draft: Draft) -> None:
+    """As where they came later: they do not tell how the agent acts."""
+    before = read_agent(draft.file).agent
+    setting(RATE, ...)(draft)
+    agent = read_agent(draft.file).agent
+    assert agent.config.low.optimiser.learning_rate == Config().low.optimiser.learning_rate
+    assert agent.config.network == before.config.network
+    assert read_params(read_agent(draft.file)).keys() == {"low", "high"}
 
 
 @pytest.mark.parametrize("name", ["chess", "letter/../letter", "agent.pkl", ""])

@@ -63,7 +63,7 @@ def main(argv: Sequence[str], *, program: str = "hrlspec export") -> None:
         CheckpointError: there is no usable checkpoint.
     """
     flags = parse_flags(ExportFlags, argv, program=program)
-    name = experiment_of(read_record(flags.run)["config"], str(flags.run)).name
+    name = experiment_of(read_record(flags.run)["config"], str(flags.run), to_act=True).name
     file = _file(flags, name)
     check_writable(file.parent)
     for there in (file, file.with_suffix(".json")):
@@ -95,7 +95,7 @@ def export(run: Path, file: Path, *, step: int | None, num_tasks: int, console: 
         CheckpointError: there is no usable checkpoint.
     """
     record = read_record(run)
-    experiment = experiment_of(record["config"], str(run))
+    experiment = experiment_of(record["config"], str(run), to_act=True)
     if experiment.is_foreign:
         raise UserError(
             f"{run} is of {experiment.env}, {experiment.method}: agents are exported whose environment and method are "
