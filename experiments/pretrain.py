@@ -113,9 +113,9 @@ def _experiment(name: str, work: Path) -> Experiment:
 
 
 def _is_current(name: str, work: Path) -> bool:
-    """Whether the packaged agent has the settings that its flags give now."""
+    """Whether the packaged agent has the settings that its flags give now, those added since as they are by default."""
     try:
-        return experiment_of(read_agent(name).card.config, name) == _experiment(name, work)
+        return experiment_of(read_agent(name).card.config, name, to_act=True) == _experiment(name, work)
     except (AgentFileError, UserError):  # there is none, or it is of another version
         return False
 
