@@ -141,6 +141,7 @@ def _evaluated(key: jax.Array, trained: TrainedAgent, preset: Preset, name: str,
     env, suite, seed = trained.agent.env, preset.suite(name), LAYOUTS["test"]
     some = suite.take(spread(len(suite), num_tasks))
     try:
+        make_cases(env, some, layouts_per_task=1, seed=seed)  # which is quicker to refuse
         evaluation = final_evaluation(env, some, episodes=len(some), seed=seed)
     except ValueError:  # nothing can satisfy some of the tasks in time: there they fail, and no case is left out
         evaluation = SuiteEvaluation(make_cases(env, some, seed=seed, optima=False))
