@@ -12,7 +12,7 @@ from hrlspec.version import __version__
 
 if TYPE_CHECKING:
     from hrlspec.agent.agent import Agent
-    from hrlspec.api import TrainedAgent, evaluate, train
+    from hrlspec.api import TrainedAgent, evaluate, pretrained, train
     from hrlspec.config import Config
     from hrlspec.learning.train import Trainer
     from hrlspec.presets import preset  # type: ignore[no-redef]  # there is a module of that name, too
@@ -29,6 +29,7 @@ __all__ = [
     "evaluate",
     "parse",
     "preset",
+    "pretrained",
     "reward_machine",
     "train",
 ]
@@ -42,6 +43,7 @@ _MODULES = {
     "evaluate": "api",
     "parse": "spec",
     "preset": "presets",
+    "pretrained": "api",
     "reward_machine": "tasks.rewards",
     "train": "api",
 }

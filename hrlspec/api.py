@@ -1,4 +1,6 @@
-"""Entry points of the library: `train` an agent, `evaluate` it. What they call can be used by itself.
+"""Entry points of the library: `train` an agent, or take a `pretrained` one, and `evaluate` it.
+
+What they call can be used by itself.
 
 Axes: **S** seeds trained in parallel.
 """
@@ -7,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -20,6 +23,7 @@ from envs_jax.arrays import Array
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.low_level import Params
 from hrlspec.agent.method import Method
+from hrlspec.agent_files import read_agent, read_params
 from hrlspec.config import evolve
 from hrlspec.evaluation import Suite, SuiteResult, evaluate_suite, suite_from_text
 from hrlspec.learning.train import Trainer, TrainState
@@ -94,6 +98,21 @@ def train(
     return TrainedAgent(agent, _params(key, Trainer(agent), machine, banks, reserved, progress), machine)
 
 
+def pretrained(name: str | os.PathLike[str]) -> TrainedAgent:
+    """An agent that was trained before, from a file; nothing in it is executed.
+
+    Args:
+        name: of an agent that comes along, such as ``letter``; or the path of a ``.safetensors`` file that ``hrlspec
+            export`` wrote, with its card beside it.
+
+    Raises:
+        AgentFileError: there is none, or file, card and this version do not fit each other.
+        ImportError: the extra ``files`` is missing, or a library that the environment needs.
+    """
+    file = read_agent(name)
+    return TrainedAgent(file.agent, read_params(file), file.rewards)
+
+
 def evaluate(
     key: Key[Array, ""],
     trained: TrainedAgent,
@@ -117,7 +136,8 @@ def evaluate(
 
     Raises:
         SpecError: a task cannot be read.
-        ValueError: a task cannot be satisfied in (nearly) any layout.
+        ValueError: a task cannot be satisfied in (nearly) any layout; or a shield is asked for, and the agent has no
+            reach critic, since it was trained without one.
     """
     agent = trained.agent
     suite = suite_from_text("tasks", tasks, agent.env.propositions) if isinstance(tasks, str) else tasks

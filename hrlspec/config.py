@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import UnionType
 from typing import Any, Literal, TypeVar
 
@@ -309,6 +309,50 @@ def evolve(settings: S, changes: Mapping[str, Any]) -> S:
         whole = inner.pop("", getattr(settings, name))
         values[name] = evolve(whole, inner) if inner else whole
     return dataclasses.replace(settings, **values)  # type: ignore[type-var]
+
+
+def from_plain(example: S, data: Any, *, prefix: str = "", needed: Callable[[str], bool] = lambda name: True) -> S:
+    """Settings from plain JSON values, as a record has them; lists become tuples.
+
+    Args:
+        example: settings of the same type, all the way down.
+        data: a value for each of the settings, under its name.
+        prefix: of their names, with its dot.
+        needed: whether the setting of a dotted name must be there; another is the example's where it is missing.
+
+    Raises:
+        ConfigError: settings are missing or unknown, or a value is of another type or out of its range.
+    """
+    fields = {field.name: getattr(example, field.name) for field in dataclasses.fields(example)}  # type: ignore[arg-type]
+    if not isinstance(data, Mapping):
+        raise ConfigError(f"{prefix.rstrip('.')} is {data!r}")
+    wrong = (data.keys() - fields) | {name for name in fields.keys() - data if needed(prefix + name)}
+    if wrong:
+        raise ConfigError(f"the setting {prefix + min(wrong)!r} is not in both")
+    hints = typing.get_type_hints(type(example))
+    return dataclasses.replace(  # type: ignore[type-var]
+        example,
+        **{
+            name: from_plain(value, data[name], prefix=f"{prefix}{name}.", needed=needed)
+            if dataclasses.is_dataclass(value)
+            else _from_plain(hints[name], data[name], prefix + name)
+            for name, value in fields.items()
+            if name in data
+        },
+    )
+
+
+def _from_plain(kind: Any, value: Any, name: str) -> Any:
+    """A value of an annotated type from a plain JSON value."""
+    origin, options = typing.get_origin(kind), typing.get_args(kind)
+    if origin is tuple and isinstance(value, list):
+        return tuple(_from_plain(options[0], item, name) for item in value)
+    if not _fits(value, kind):
+        raise ConfigError(f"{name} is {value!r}")
+    try:
+        return float(value) if kind is float else value
+    except OverflowError:
+        raise ConfigError(f"{name} is too large") from None
 
 
 def without_copies(config: Config) -> Config:

@@ -27,6 +27,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("hrlspec.checkpoint",),
     ("hrlspec.evaluation",),
     ("hrlspec.presets",),
+    ("hrlspec.agent_files",),
     ("hrlspec.api", "hrlspec.gymnasium"),
     ("hrlspec",),  # what its __init__ offers
     ("hrlspec.run",),

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from hrlspec.agent_files import packaged_agents
 from hrlspec.presets import PRESETS
 from hrlspec.run.replay import page
 from hrlspec.version import __version__
@@ -61,6 +62,8 @@ def test_what_is_inside(wheel: Path) -> None:
         assert {f"hrlspec/presets/suites/{preset.name}/{file}" for file in files} <= names
     templates = {f"hrlspec/run/replay/{file}" for file in ("page.html", "page.css", *page.SCRIPTS)}
     assert templates <= names
+    agents = {f"hrlspec/agent_files/packaged/{name}" for name in packaged_agents()}
+    assert {f"{agent}.{kind}" for agent in agents for kind in ("json", "safetensors")} <= names
     assert "hrlspec = hrlspec.run.cli:console" in entry_points
     modules = {
         str(file.relative_to(ROOT)) for package in ("hrlspec", "envs_jax") for file in (ROOT / package).rglob("*.py")
@@ -78,6 +81,14 @@ def test_the_packages_are_those_of_the_wheel(scripts: Path, tmp_path: Path) -> N
     assert all(Path(file).is_relative_to(scripts.parent) for file in files)
     assert tasks == "200"
     assert "No module named 'experiments'" in call(scripts / "python", "-c", "import experiments", cwd=tmp_path).stderr
+
+
+def test_an_agent_acts_without_training(scripts: Path, tmp_path: Path) -> None:
+    flags = ["--pretrained", "letter", "--spec", "achieve a", "--episodes", "20", "--json"]
+    said = call(scripts / "hrlspec", "evaluate", *flags, cwd=tmp_path)
+    assert said.returncode == 0, said.stderr
+    assert json.loads(said.stdout)["success_rate"] > 0.5
+    assert not [*tmp_path.iterdir()]
 
 
 def test_the_command(scripts: Path, tmp_path: Path) -> None:

@@ -63,6 +63,10 @@ class Agent:
         low, drawn, reach_critic = randomised(key, (low, high if learned else {}, reach_critic))
         return {"low": low, "high": drawn if learned else high, "reach_critic": reach_critic}
 
+    def acting(self, params: Params) -> Params:
+        """The parts that acting needs: the reach critic is left out where it does not learn, as no shield collects."""
+        return {name: part for name, part in params.items() if name != "reach_critic" or self.config.shield.enabled}
+
 
 def _blank_tree(num_propositions: int) -> TaskTree:
     """Two nodes and no edge, to initialise the networks with; no parameter's shape depends on N."""

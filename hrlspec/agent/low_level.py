@@ -181,7 +181,13 @@ class LowLevel:
         return jax.vmap(self.control, in_axes=(None, 0, 0))(params, view, now)[1]
 
     def reach_values(self, params: Params, view: View) -> Float32[Array, "P K"]:
-        """Q(s, g, a) of reaching each proposition by each candidate action, float32 ``[P, K]``."""
+        """Q(s, g, a) of reaching each proposition by each candidate action, float32 ``[P, K]``.
+
+        Raises:
+            ValueError: the agent has no reach critic.
+        """
+        if "reach_critic" not in params:
+            raise ValueError("a shield needs a reach critic, and this agent, trained without a shield, has none")
         return cast(Array, self.reach_critic.apply(params["reach_critic"], view))
 
     def reach_values_of(

@@ -19,12 +19,14 @@ COMMANDS = {
     "run": "train an agent, evaluate it on unseen tasks, draw what it does",
     "evaluate": "evaluate a trained agent on tasks of your own, or draw it",
     "replay": "a page that plays episodes of trained agents, with what they thought",
+    "export": "an agent as a file of parameters and a card that says what it is",
     "demo": "the paper's two motivating examples, trained and drawn",
     "reproduce": "the paper's figures, in a checkout of the project",
     "peers": "agents on formulas of others, beside published results, in a checkout",
+    "pretrain": "the agents that come along, trained anew, in a checkout of the project",
     "suites": "draw the test suites anew, or check them",
 }
-_IN_CHECKOUT = ("reproduce", "peers")
+_IN_CHECKOUT = ("reproduce", "peers", "pretrain")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -33,10 +33,10 @@ class Interrupted(Exception):
 def main_guard(main: Callable[[], None]) -> int:
     """Runs a command line and returns its exit status: ``sys.exit(main_guard(main))``.
 
-    `UserError`, `SpecError`, `SuiteError` and `CheckpointError` become one line on standard error and status 2;
-    `Interrupted` becomes one and status 130. Where the work does not stop in order, Ctrl-C and SIGTERM end the process
-    with status 130. What the system refuses, such as room on a disk that is full, becomes one line and status 1.
-    ``SystemExit``, which the parser of flags raises, passes through.
+    `UserError`, `SpecError`, `SuiteError`, `CheckpointError` and `AgentFileError` become one line on standard error and
+    status 2; `Interrupted` becomes one and status 130. Where the work does not stop in order, Ctrl-C and SIGTERM end
+    the process with status 130. What the system refuses, such as room on a disk that is full, becomes one line and
+    status 1. ``SystemExit``, which the parser of flags raises, passes through.
 
     Nothing that cannot be written stops the work. If it was a result it is said at the end, with status 1; a reader
     who left, as in ``... | head``, has what it wants.
@@ -68,11 +68,12 @@ def in_words(error: Exception) -> str:
 
 def _expected() -> tuple[type[Exception], ...]:
     """What the user can mend. Imported when needed: these modules take seconds, and signals come meanwhile."""
+    from hrlspec.agent_files import AgentFileError
     from hrlspec.checkpoint import CheckpointError
     from hrlspec.presets.suites import SuiteError
     from hrlspec.spec import SpecError
 
-    return UserError, SpecError, SuiteError, CheckpointError
+    return UserError, SpecError, SuiteError, CheckpointError, AgentFileError
 
 
 def _say(line: str, status: int) -> int:

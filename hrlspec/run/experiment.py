@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import types
-import typing
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
 from hrlspec.agent.agent import Agent
-from hrlspec.config import Checked, Config, ConfigError, setting
+from hrlspec.agent_files import acts
+from hrlspec.config import Checked, Config, ConfigError, from_plain, setting
 from hrlspec.methods import Method
 from hrlspec.presets import Preset, Recipe, RewardSet, Split
 from hrlspec.run.errors import UserError
@@ -58,6 +57,7 @@ class Experiment:
         evaluation: when and on what it is evaluated.
         config: settings that all methods share.
         method_settings: the method itself, whose fields are its settings.
+        begun_from: SHA-256 of the file of parameters that training begins from; ``None`` for fresh ones.
     """
 
     env: str
@@ -68,6 +68,7 @@ class Experiment:
     evaluation: EvaluationConfig
     config: Config
     method_settings: Method
+    begun_from: str | None = None
 
     @property
     def name(self) -> str:
@@ -105,8 +106,14 @@ class Experiment:
         return self.preset.rewards(self.reward_set)
 
 
-def experiment_of(record: Mapping[str, Any], where: str) -> Experiment:
+def experiment_of(record: Mapping[str, Any], where: str, *, to_act: bool = False) -> Experiment:
     """The experiment in ``config.json``'s ``config``.
+
+    Args:
+        record: its entries.
+        where: what to call it in messages.
+        to_act: whether it is wanted for an agent to act. Settings that training alone heeds may then be missing, as
+            where they came later, and have their defaults.
 
     Raises:
         UserError: the record is of a version with other settings, or its environment or method is not to be had.
@@ -118,47 +125,7 @@ def experiment_of(record: Mapping[str, Any], where: str) -> Experiment:
         raise UserError(f"{where} is a run that cannot be read here: {error}") from None
     example = Experiment("", "", "hrlspec", 1, 0, EvaluationConfig(), Config(), method)
     try:
-        experiment: Experiment = _like(example, record, where, "")
+        # Before training could begin from given parameters, every run began afresh.
+        return from_plain(example, {"begun_from": None, **record}, needed=acts if to_act else lambda _: True)
     except ConfigError as error:
         raise UserError(f"{where} was made by another version of hrlspec: {error}") from None
-    return experiment
-
-
-def _like(example: Any, data: Any, where: str, prefix: str) -> Any:
-    """A dataclass of the type of an example from plain JSON values; lists become tuples."""
-    fields = {field.name: getattr(example, field.name) for field in dataclasses.fields(example)}
-    if not isinstance(data, Mapping) or data.keys() != fields.keys():
-        found = set(data) if isinstance(data, Mapping) else set()
-        name = prefix + min(found ^ fields.keys(), default="")
-        raise UserError(f"{where} was made by another version of hrlspec: the setting {name!r} is not in both")
-    hints = typing.get_type_hints(type(example))
-    return type(example)(
-        **{
-            name: _like(value, data[name], where, f"{prefix}{name}.")
-            if dataclasses.is_dataclass(value)
-            else _value(hints[name], data[name], where, f"{prefix}{name}")
-            for name, value in fields.items()
-        }
-    )
-
-
-def _value(kind: Any, value: Any, where: str, name: str) -> Any:
-    """A value of an annotated type from a plain JSON value."""
-    origin, options = typing.get_origin(kind), typing.get_args(kind)
-    if origin is tuple and isinstance(value, list):
-        return tuple(_value(options[0], item, where, name) for item in value)
-    if origin is Literal:
-        fits = value in options
-    elif origin in (typing.Union, types.UnionType):
-        fits = any(_is(option, value) for option in options)
-    else:
-        fits = _is(kind, value)
-    if not fits:
-        raise UserError(f"{where} was made by another version of hrlspec: {name} is {value!r}")
-    return float(value) if kind is float else value
-
-
-def _is(kind: Any, value: Any) -> bool:
-    if kind is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    return type(value) is kind

@@ -247,8 +247,7 @@ def _open(
         check_place(folder, resume=resume)  # again under the lock: another process may have begun a run meanwhile
         if not resume:
             undo.callback(_remove_beginnings, folder)
-        circumstances = _circumstances()
-        record = {"format": FORMAT, "config": resolved, "config_hash": config_hash(resolved), **circumstances}
+        record = {"format": FORMAT, "config": resolved, "config_hash": config_hash(resolved), **circumstances()}
         if resume:
             record["earlier"] = _replaced(folder, resolved, may_change)
         _write_atomically(folder / "config.json", json.dumps(record, indent=2) + "\n")
@@ -265,9 +264,9 @@ def _replaced(folder: Path, config: Any, may_change: Sequence[str]) -> list[dict
     record = read_record(folder)
     check_same(folder, record["config"], config, may_change)
     entry = {name: value for name, value in record.items() if name not in ("format", "config", "earlier")}
-    old, new = _dotted(record["config"]), _dotted(config)
-    if old != new:
-        entry["changed"] = {name: value for name, value in old.items() if new.get(name) != value}
+    changed = {name: there for name, (there, _) in differences(record["config"], config).items()}
+    if changed:
+        entry["changed"] = changed
         summary = read_summary(folder)
         if summary is not None:
             (folder / "summary.json").replace(folder / f"summary-{summary['env_steps']}.json")
@@ -349,16 +348,24 @@ def check_same(folder: Path, there: Any, here: Any, may_change: Sequence[str]) -
     Raises:
         UserError: something else differs; it names the first such difference.
     """
-    old, new = _dotted(there), _dotted(_plain(here))
-    names = [name for name in sorted(old.keys() | new.keys()) if old.get(name) != new.get(name)]
-    names = [name for name in names if name not in may_change]
-    if names:
-        first = names[0]
-        more = f" ({len(names) - 1} more differ)" if len(names) > 1 else ""
+    differing = {name: values for name, values in differences(there, here).items() if name not in may_change}
+    if differing:
+        first, (old, new) = next(iter(differing.items()))
+        more = f" ({len(differing) - 1} more differ)" if len(differing) > 1 else ""
         raise UserError(
-            f"{folder} was begun with {first} = {old.get(first, 'nothing')!r}, not {new.get(first, 'nothing')!r}"
+            f"{folder} was begun with {first} = {old!r}, not {new!r}"
             f"{more}: resume with the flags it was begun with, or choose another --out"
         )
+
+
+def differences(there: Any, here: Any) -> dict[str, tuple[Any, Any]]:
+    """Settings in which two configurations differ, by dotted names in their order: the value there, the value here."""
+    old, new = _dotted(_plain(there)), _dotted(_plain(here))
+    return {
+        name: (old.get(name, "nothing"), new.get(name, "nothing"))
+        for name in sorted(old.keys() | new.keys())
+        if old.get(name) != new.get(name)
+    }
 
 
 def _dotted(config: Any, prefix: str = "") -> dict[str, Any]:
@@ -420,8 +427,8 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"a {type(value).__name__} has no form in JSON: {value!r}")
 
 
-def _circumstances() -> dict[str, Any]:
-    """What a run's numbers depend on beside its configuration."""
+def circumstances() -> dict[str, Any]:
+    """What numbers depend on beside the configuration: versions, commit, command, time, machine, devices."""
     versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
     return {
         "versions": {"hrlspec": __version__, "python": platform.python_version(), **versions},

@@ -36,7 +36,7 @@ from hrlspec.run.programs import Program
 from hrlspec.tasks.bank import TaskBanks, joint_labels
 
 PERIODIC_TASKS = (1, 2, 5, 10)  # the most there are; each divides the number of episodes
-_LAYOUTS: dict[Split, int] = {"validation": 1, "test": 2}
+LAYOUTS: dict[Split, int] = {"validation": 1, "test": 2}
 """Seeds of the layouts at the end; the learning curve's have another one."""
 _EVALUATION_STREAM, _FINAL_STREAM = 1, 2  # of random numbers, apart from training's
 
@@ -74,13 +74,15 @@ class Learner:
         experiment: what to learn.
         preset: its environment's, with test suites.
         devices: how many train it; see `hrlspec.learning.train.Trainer`.
+        params: parameters to begin from, by part; parts that are not among them are fresh.
 
     Raises:
         UserError: no training task can be drawn under the experiment's configuration.
     """
 
-    def __init__(self, experiment: Experiment, preset: Preset, devices: int = 1) -> None:
+    def __init__(self, experiment: Experiment, preset: Preset, devices: int = 1, params: Params | None = None) -> None:
         self.experiment, self.preset = experiment, preset
+        self._given = params or {}
         self.agent = experiment.agent
         self.env = self.agent.env
         self.trainer = Trainer(self.agent, devices)
@@ -115,7 +117,7 @@ class Learner:
         settings = self.experiment.evaluation
         keys = jax.random.split(self._key(_FINAL_STREAM), 3)
         how = self.agent, params, self.machine
-        where: dict[str, Any] = {"seed": _LAYOUTS[settings.final], "greedy": settings.greedy}
+        where: dict[str, Any] = {"seed": LAYOUTS[settings.final], "greedy": settings.greedy}
         suite = self._some("dag")
         result = final_evaluation(self.env, suite, episodes=len(suite), **where)(keys[0], *how)
         choice = returns = first = None
@@ -146,7 +148,7 @@ class Learner:
         """As many tasks of a suite as the evaluation at the end asks for, evenly spread."""
         settings = self.experiment.evaluation
         suite = self.preset.suite_for(settings.final, name)
-        return suite.take(_spread(len(suite), settings.final_tasks))
+        return suite.take(spread(len(suite), settings.final_tasks))
 
     @functools.cached_property
     def _periodic(self) -> SuiteEvaluation:
@@ -164,7 +166,10 @@ class Learner:
     def _init(self) -> TrainState:
         key = jax.random.key(self.experiment.seed)
         state: TrainState = self._init_program(key, self._banks.at(0), self.machine)
-        return state
+        # Copies, since the state is donated; where the fresh parameters lie.
+        fresh = {name: part for name, part in state.params.items() if name in self._given}
+        begun = jax.tree.map(lambda new, old: jax.device_put(jnp.array(new), old.sharding), self._given, fresh)
+        return dataclasses.replace(state, params={**state.params, **begun})
 
     def _iterate(self, state: TrainState, index: int) -> tuple[TrainState, Mapping[str, jax.Array]]:
         result: tuple[TrainState, Mapping[str, jax.Array]] = self._iterate_program(
@@ -204,6 +209,6 @@ def _all_finite(params: Params) -> jax.Array:
     return jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(params)]))
 
 
-def _spread(total: int, wanted: int) -> np.ndarray:
+def spread(total: int, wanted: int) -> np.ndarray:
     """Rows spread evenly over a suite, which is ordered by depth."""
     return np.unique(np.linspace(0, total - 1, min(total, wanted)).round().astype(int))

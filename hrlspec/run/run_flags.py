@@ -18,6 +18,7 @@ from hrlspec.run.errors import UserError
 from hrlspec.run.experiment import EvaluationConfig, Experiment
 from hrlspec.run.flags import flag_of, in_flags, parse_flags, settings_in
 from hrlspec.run.lookup import method_named, preset_named
+from hrlspec.run.trained import find_file
 
 _FIRST = next(iter(PRESETS))
 _LAST_SEED = 2**31 - 1
@@ -47,6 +48,9 @@ class RunFlags(Checked):
     """Environment steps; the preset's if not given."""
     out: Path | None = None
     """The run folder; runs/<name> if not given. With several seeds, the folder that holds seed<n>/."""
+    from_: Annotated[str | None, arg(name="from")] = None
+    """An agent whose parameters training begins from, with everything else fresh: one that comes along, by its name, or
+    a .safetensors file. Environment, method and networks must be its own."""
     resume: bool = False
     """Continue what is in the folder, with the flags it was begun with; finished seeds are skipped. More --total-steps
     make a run longer, finished or not."""
@@ -125,12 +129,14 @@ def experiments_of(flags: RunFlags) -> list[tuple[Experiment, Path]]:
 
     Raises:
         UserError: the settings do not make sense.
+        AgentFileError: there is no such agent to begin from.
     """
     try:
         config, method = _switched(flags)
         method.high.check(config)
     except ConfigError as error:
         raise UserError(in_flags(error, flags)) from None
+    begun_from = None if flags.from_ is None else find_file(flags.from_).card.sha256
     runs = []
     for seed in range(flags.seed, flags.seed + flags.num_seeds):
         experiment = Experiment(
@@ -142,6 +148,7 @@ def experiments_of(flags: RunFlags) -> list[tuple[Experiment, Path]]:
             evaluation=flags.evaluation,
             config=config,
             method_settings=method,
+            begun_from=begun_from,
         )
         if flags.out is None:
             folder = Path("runs") / experiment.name

@@ -10,14 +10,16 @@ from hrlspec.presets.generic import unseen_tasks
 from hrlspec.run.errors import UserError
 
 
-def with_tasks(preset: Preset, folder: Path, seed: int) -> Preset:
-    """The preset, with suites if it has none: those in the run folder, or some drawn with the run's seed.
+def with_tasks(preset: Preset, folder: Path | None, seed: int) -> Preset:
+    """The preset, with suites if it has none: those in the run folder, if there is one, or some drawn with the seed.
 
     Raises:
         UserError: the run folder's suite cannot be read.
     """
     if preset.suite_names:
         return preset
+    if folder is None:
+        return dataclasses.replace(preset, texts=unseen_tasks(preset.make(), seed))
     tasks = folder / "tasks"
     try:
         found = {file.stem: file.read_text(encoding="utf-8") for file in sorted(tasks.glob("*.txt"))}

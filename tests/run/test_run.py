@@ -20,15 +20,18 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 from PIL import Image
 
+import hrlspec
 from hrlspec import checkpoint
+from hrlspec.agent_files import read_agent
 from hrlspec.checkpoint import state_hash
 from hrlspec.run import plots, signals
-from hrlspec.run.commands import evaluate, run
+from hrlspec.run.commands import evaluate, export, run
 from hrlspec.run.errors import main_guard
 from hrlspec.run.experiment import experiment_of
 from hrlspec.run.folder import read_metrics, read_record
 from hrlspec.run.learner import Learner
 from hrlspec.run.progress import ProgressDisplay
+from hrlspec.run.run_flags import experiments_of, parse_run
 from hrlspec.spec import RUNNING, SATISFIED
 from hrlspec.spec.dfa import from_json
 from tests.run import tiny
@@ -446,3 +449,66 @@ def test_an_environment_and_a_method_of_somebody_elses(
     Path("run/summary.json").unlink()
     assert call(*flags, "--resume") == 2
     assert "no test tasks in run/tasks/dag.txt" in capsys.readouterr().err
+
+
+# The same agent as a file.
+
+
+@pytest.fixture(scope="module")
+def exported(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("exported") / "it.safetensors"
+    flags = ["--run", str(finished), "--out", str(file), "--tasks", "2"]
+    assert main_guard(lambda: export.main(flags)) == 0
+    return file
+
+
+def test_what_an_export_says(finished: Path, exported: Path) -> None:
+    card, record = json.loads(exported.with_suffix(".json").read_text()), read_record(finished)
+    assert card["config"] == record["config"]
+    assert card["env_steps"] == tiny.TOTAL
+    assert card["trained"] == {"commit": record["commit"], "versions": record["versions"]}
+    assert card["results"].keys() == card["success_at_least"].keys() == {"dag", "branches", "deeper", "wider"}
+    for suite, score in card["results"].items():
+        assert score["episodes"] == 20
+        assert 0 <= score["success_rate_interval"][0] - card["success_at_least"][suite] < 1e-3
+
+
+@pytest.mark.parametrize("tasks", [("--spec", LARGE), ("--ltl", "F a")])
+def test_an_exported_agent_acts_as_the_run_does(
+    tasks: tuple[str, str], finished: Path, exported: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """To the bit: parameters, actions, and so all scores."""
+    trained = hrlspec.pretrained(exported)
+    state = checkpoint.load(finished / "checkpoints", {"params": trained.params}, partial=True).state
+    assert state_hash(state["params"]) == state_hash(trained.params)
+    reports = []
+    for agent in (["--run", str(finished)], ["--pretrained", str(exported)]):
+        assert main_guard(lambda agent=agent: evaluate.main([*agent, *tasks, "--episodes", "20", "--json"])) == 0
+        reports.append(json.loads(capsys.readouterr().out))
+    assert (reports[0].pop("run"), reports[0].pop("checkpoint_step")) == (str(finished), tiny.TOTAL)
+    assert (reports[1].pop("pretrained"), reports[1].pop("env_steps")) == (str(exported), tiny.TOTAL)
+    assert reports[0] == reports[1]
+
+
+def test_training_goes_on_from_an_exported_agent(
+    finished: Path, exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Everything but the parameters is fresh, and a run that goes on needs the same ones."""
+    folder, file = tmp_path / "run", read_agent(exported)
+    flags = tiny.arguments(folder, "--from", str(exported))
+    ((experiment, _),) = experiments_of(parse_run(flags))
+    fresh = Learner(experiment, experiment.preset).job().init()
+    begun = Learner(experiment, experiment.preset, params=hrlspec.pretrained(exported).params).job().init()
+    given = hrlspec.pretrained(exported).params
+    assert state_hash({name: begun.params[name] for name in given}) == state_hash(given)
+    assert state_hash(begun.replace(params=fresh.params)) == state_hash(fresh)
+    assert state_hash(begun.params["reach_critic"]) == state_hash(fresh.params["reach_critic"])
+    assert jax.tree.map(lambda x: x.sharding, begun) == jax.tree.map(lambda x: x.sharding, fresh)
+    assert call(*flags) == 0
+    assert read_record(folder)["config"]["begun_from"] == file.card.sha256
+    assert rows(folder) != rows(finished)
+    capsys.readouterr()
+    assert call(*tiny.arguments(folder, "--resume")) == 2
+    assert f"begun with begun_from = '{file.card.sha256}', not None" in capsys.readouterr().err
+    assert call(*flags, "--resume") == 0
+    assert "is finished" in capsys.readouterr().out

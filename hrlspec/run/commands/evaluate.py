@@ -1,4 +1,4 @@
-"""Evaluates a trained agent: ``hrlspec evaluate --run DIR``, with ``--help`` for the flags.
+"""Evaluates a trained agent: ``hrlspec evaluate --run DIR``, or ``--pretrained NAME``, with ``--help`` for the flags.
 
 Exit status: 0 done, 2 bad usage or input.
 """
@@ -15,9 +15,6 @@ import jax
 import numpy as np
 
 from envs_jax import Environment
-from hrlspec import checkpoint
-from hrlspec.agent.agent import Agent
-from hrlspec.agent.low_level import Params
 from hrlspec.api import TrainedAgent, evaluate
 from hrlspec.config import Checked, setting
 from hrlspec.evaluation import (
@@ -33,17 +30,17 @@ from hrlspec.evaluation import (
 from hrlspec.evaluation.ltl import MAX_NODES as LTL_NODES
 from hrlspec.evaluation.ltl import check_propositions, suite_of_automata
 from hrlspec.evaluation.suite import MAX_NODES
+from hrlspec.presets import Preset
 from hrlspec.presets.peers import go_on_for_ever, peer_formulas
 from hrlspec.run import platform
 from hrlspec.run.automaton_file import PICTURES, check_automaton, check_automaton_file, write_automaton
 from hrlspec.run.console import result_console
 from hrlspec.run.errors import UserError
-from hrlspec.run.experiment import Experiment, experiment_of
 from hrlspec.run.extras import check_drawing, drawing
 from hrlspec.run.flags import parse_flags
-from hrlspec.run.folder import check_file, read_record
+from hrlspec.run.folder import check_file
 from hrlspec.run.tables import ltl_table, suite_table
-from hrlspec.run.unseen import with_tasks
+from hrlspec.run.trained import Source, find_trained
 from hrlspec.spec import SpecError, bare_lines
 from hrlspec.spec.dfa import from_json
 from hrlspec.spec.hoa import from_hoa, until_accepting
@@ -59,11 +56,14 @@ _LARGEST_FILE = 1_000_000  # bytes
 class EvaluateFlags(Checked):
     """Reports success, return, steps and SPL of a trained agent on the given tasks, in layouts drawn at random.
 
-    Exactly one of --spec, --spec-file, --ltl, --ltl-file, --hoa, --dfa and --suite says which tasks.
+    Exactly one of --run and --pretrained says which agent, and exactly one of --spec, --spec-file, --ltl, --ltl-file,
+    --hoa, --dfa and --suite which tasks.
     """
 
-    run: Path
-    """The run folder."""
+    run: Path | None = None
+    """The run folder of the agent."""
+    pretrained: str | None = None
+    """An agent that comes along, by its name, such as letter; or the .safetensors file of one."""
     spec: str | None = None
     """A task in SPECTRL, such as "achieve a; (achieve b ensuring not c)"."""
     spec_file: Path | None = None
@@ -82,17 +82,17 @@ class EvaluateFlags(Checked):
     """Count how often a formula's accepting transitions are taken, instead of asking whether it is satisfied in the
     end. Published suites know it of themselves."""
     suite: str | None = None
-    """A suite of the run's environment, such as dag, or published formulas, such as jaxolotl/letter_finite."""
+    """A suite of the agent's environment, such as dag, or published formulas, such as jaxolotl/letter_finite."""
     episodes: int = setting(500, least=1, most=1_000_000)
     """In all; at least one for each task. For tasks as automata, of each."""
     seed: int = setting(0, least=0, most=2**31 - 1)
     """Of layouts and actions."""
     step: int | None = None
-    """The checkpoint to load; the newest if not given."""
+    """The checkpoint of the run to load; the newest if not given."""
     greedy: bool = False
     """Take the most likely action and sub-task instead of sampling."""
     shield: bool = False
-    """Replace actions that would step on forbidden propositions."""
+    """Replace actions that would step on forbidden propositions, if the agent was trained with a shield."""
     max_nodes: int = setting(MAX_NODES, least=2, most=4096)
     """Largest task tree. Trees of automata are cut at 64 nodes, or fewer."""
     draw: Path | None = None
@@ -115,31 +115,32 @@ def main(argv: Sequence[str], *, program: str = "hrlspec evaluate") -> None:
         UserError: bad usage or input.
         SpecError: a task cannot be read.
         CheckpointError: there is no usable checkpoint.
+        AgentFileError: there is no such agent in a file, or it cannot be used.
     """
     flags = parse_flags(EvaluateFlags, argv, program=program)
+    source = find_trained(flags.run, flags.pretrained, flags.step)
     _check(flags)
-    experiment = experiment_of(read_record(flags.run)["config"], str(flags.run))
-    tasks = formulas_of(flags, experiment) or tasks_of(flags, experiment)
+    tasks = formulas_of(flags, source.preset) or tasks_of(flags, source)
     if flags.draw is not None and isinstance(tasks, LtlSuite):
         raise UserError("--draw takes tasks in SPECTRL, no formulas and no automata; --automaton draws one of these")
     platform.prepare()
-    automaton = None if flags.automaton is None else _automaton_of(flags.automaton, tasks, experiment)
-    agent = experiment.agent
-    params, step = load_params(agent, flags.run, flags.step)
-    facts = {"run": str(flags.run), "checkpoint_step": step, "reward_set": experiment.reward_set}
+    automaton = None if flags.automaton is None else _automaton_of(flags.automaton, tasks, source.preset)
+    trained, facts = source.load()
+    if flags.shield and "reach_critic" not in trained.params:
+        raise UserError("--shield needs the reach critic of an agent that was trained with a shield; this one was not")
     key = jax.random.fold_in(jax.random.key(flags.seed), 1)
     how: dict[str, Any] = {name: getattr(flags, name) for name in ("episodes", "seed", "greedy", "shield")}
     if isinstance(tasks, LtlSuite):
-        _show(flags, evaluate_ltl(key, agent, params, experiment.rewards, tasks, **how), facts)
+        _show(flags, evaluate_ltl(key, trained.agent, trained.params, trained.rewards, tasks, **how), facts)
     else:
         try:
-            result = evaluate(key, TrainedAgent(agent, params, experiment.rewards), tasks, **how)
+            result = evaluate(key, trained, tasks, **how)
         except ValueError as error:
             raise UserError(str(error)) from error  # a task that nothing can satisfy
         _show(flags, result, facts)
         if flags.draw is not None:
             with drawing():
-                _draw(flags, agent, params, experiment, tasks)
+                _draw(flags, trained, tasks)
     if automaton is not None and flags.automaton is not None:
         write_automaton(automaton, tasks.formulas[0], flags.automaton)
 
@@ -160,29 +161,18 @@ def _show(flags: EvaluateFlags, result: SuiteResult | LtlResult, facts: dict[str
             console.say(f"{score.success_rate.estimate:.3f}  {task.task}")
 
 
-def _draw(flags: EvaluateFlags, agent: Agent, params: Params, experiment: Experiment, suite: Suite) -> None:
+def _draw(flags: EvaluateFlags, trained: TrainedAgent, suite: Suite) -> None:
     from hrlspec.run import plots
 
     assert flags.draw is not None
     some = suite.take(np.arange(min(len(suite), MOST_PICTURES)))
-    machine = experiment.rewards
-    episodes = plots.episodes_of(jax.random.key(flags.seed), agent, params, machine, some)
+    agent, key = trained.agent, jax.random.key(flags.seed)
+    episodes = plots.episodes_of(key, agent, trained.params, trained.rewards, some)
     flags.draw.parent.mkdir(parents=True, exist_ok=True)
     plots.gallery(episodes, agent.env.propositions, flags.draw)
 
 
-def load_params(agent: Agent, run: Path, step: int | None = None) -> tuple[Params, int]:
-    """The parameters in a run's newest intact checkpoint, or in that of ``step``, and its step.
-
-    Raises:
-        CheckpointError: there is none.
-    """
-    target = {"params": jax.eval_shape(agent.init, jax.random.key(0))}
-    restored = checkpoint.load(run / "checkpoints", target, step=step, partial=True)
-    return restored.state["params"], restored.step
-
-
-def _automaton_of(file: Path, tasks: Suite | LtlSuite, experiment: Experiment) -> Automaton:
+def _automaton_of(file: Path, tasks: Suite | LtlSuite, preset: Preset) -> Automaton:
     """The automaton of the one task.
 
     Raises:
@@ -194,7 +184,7 @@ def _automaton_of(file: Path, tasks: Suite | LtlSuite, experiment: Experiment) -
     if isinstance(tasks, LtlSuite):
         (automaton,) = tasks.sources
     else:
-        env = experiment.preset.make()
+        env = preset.make()
         check_propositions(tasks.name, env)
         tree = jax.tree.map(lambda x: x[0], tasks.trees)
         automaton = committed_automaton(tree, env.propositions, env.possible_labels)
@@ -202,7 +192,7 @@ def _automaton_of(file: Path, tasks: Suite | LtlSuite, experiment: Experiment) -
     return automaton
 
 
-def formulas_of(flags: EvaluateFlags, experiment: Experiment) -> LtlSuite | None:
+def formulas_of(flags: EvaluateFlags, preset: Preset) -> LtlSuite | None:
     """The tasks that are carried out as automata; ``None`` if the flags name tasks that are trees.
 
     Raises:
@@ -210,7 +200,7 @@ def formulas_of(flags: EvaluateFlags, experiment: Experiment) -> LtlSuite | None
         SuiteError: no such suite.
         SpecError: a task cannot be read, or its automaton is too large.
     """
-    env, max_nodes = experiment.preset.make(), min(flags.max_nodes, LTL_NODES)
+    env, max_nodes = preset.make(), min(flags.max_nodes, LTL_NODES)
     if flags.hoa is not None:
         return _of_automaton(flags.hoa, flags, env)
     if flags.dfa is not None:
@@ -242,7 +232,7 @@ def _of_automaton(file: Path, flags: EvaluateFlags, env: Environment) -> LtlSuit
     return suite_of_automata(file.name, [file.name], [automaton], env, max_nodes=min(flags.max_nodes, LTL_NODES))
 
 
-def tasks_of(flags: EvaluateFlags, experiment: Experiment) -> Suite:
+def tasks_of(flags: EvaluateFlags, source: Source) -> Suite:
     """The tasks that the flags name.
 
     Raises:
@@ -250,9 +240,9 @@ def tasks_of(flags: EvaluateFlags, experiment: Experiment) -> Suite:
         SpecError: a task cannot be read or is too large.
     """
     if flags.suite is not None:
-        return with_tasks(experiment.preset, flags.run, experiment.seed).suite(flags.suite)
+        return source.suite(flags.suite)
     name, text = _spectrl(flags)
-    return suite_from_text(name, text, experiment.preset.make().propositions, max_nodes=flags.max_nodes)
+    return suite_from_text(name, text, source.preset.make().propositions, max_nodes=flags.max_nodes)
 
 
 def _spectrl(flags: EvaluateFlags) -> tuple[str, str]:

@@ -6,12 +6,15 @@ input, 130 interrupted with a checkpoint written.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 
+from hrlspec.agent.low_level import Params
+from hrlspec.agent_files import AgentFile
 from hrlspec.evaluation import SuiteResult, aggregate
 from hrlspec.learning.shards import most_devices
 from hrlspec.run import platform
@@ -23,6 +26,7 @@ from hrlspec.run.folder import (
     RunFolder,
     check_place,
     check_same,
+    differences,
     holds_run,
     open_run,
     read_metrics,
@@ -35,6 +39,7 @@ from hrlspec.run.progress import ProgressDisplay, duration
 from hrlspec.run.run_flags import RunFlags, experiments_of, parse_run, schedules_moved
 from hrlspec.run.signals import ended_by_signals
 from hrlspec.run.tables import aggregate_table, final_tables
+from hrlspec.run.trained import find_file, load_file
 from hrlspec.run.unseen import with_tasks
 
 
@@ -47,22 +52,38 @@ def main(argv: Sequence[str], *, program: str = "hrlspec run") -> None:
 
     Raises:
         UserError: bad usage or input; nothing was written.
+        AgentFileError: the agent to begin from cannot be used; nothing was written.
         Interrupted: stopped by a signal; a checkpoint was written.
         SystemExit: with a message, when training diverged.
     """
     flags = parse_run(argv, program=program)
     runs = experiments_of(flags)
     resumed = _check_folders(runs, flags)
+    given = None if flags.from_ is None else _file_that_fits(flags.from_, runs[0][0])
     devices = _devices(flags, runs[0][0].config.blocks)
+    params = None if given is None else load_file(given)
     console = result_console()
     summaries = [
-        _run(experiment, folder, resume, devices, flags, console)
+        _run(experiment, folder, resume, devices, params, flags, console)
         for (experiment, folder), resume in zip(runs, resumed, strict=True)
     ]
     if len(summaries) > 1:
         results = [SuiteResult.from_json(summary["final"]["suite"]) for summary in summaries]
         name = runs[0][0].name.rpartition("-")[0]
         console.print(aggregate_table(f"{name}, seeds {flags.seed} to {runs[-1][0].seed}", aggregate(results)))
+
+
+def _file_that_fits(name: str, experiment: Experiment) -> AgentFile:
+    """The agent that training begins from, if it has the experiment's environment, method and networks.
+
+    Raises:
+        UserError: it has not.
+    """
+    file = find_file(name)
+    for setting, (there, here) in differences(file.card.config, experiment).items():
+        if setting in ("env", "method") or re.match(r"(config|method_settings\..*)\.network\.", setting):
+            raise UserError(f"--from {name} has {setting} = {there!r}, not {here!r}: train on with what it has")
+    return file
 
 
 def _devices(flags: RunFlags, blocks: int) -> int:
@@ -119,7 +140,13 @@ def _results(experiment: Experiment, folder: Path) -> dict[str, Any] | None:
 
 
 def _run(
-    experiment: Experiment, folder: Path, resume: bool, devices: int, flags: RunFlags, console: PlainConsole
+    experiment: Experiment,
+    folder: Path,
+    resume: bool,
+    devices: int,
+    params: Params | None,
+    flags: RunFlags,
+    console: PlainConsole,
 ) -> dict[str, Any]:
     """One run from its beginning, or from where it was left, to its summary."""
     summary = _results(experiment, folder) if resume else None
@@ -128,7 +155,7 @@ def _run(
         return summary
     before = experiment_of(read_record(folder)["config"], str(folder)) if resume else experiment
     preset = with_tasks(experiment.preset, folder, experiment.seed)
-    learner = Learner(experiment, preset, devices)
+    learner = Learner(experiment, preset, devices, params)
     with open_run(folder, experiment, resume=resume, may_change=_may_change(flags)) as run:
         # Suite dag comes last: where it is there all are.
         for name, text in sorted(preset.texts.items(), reverse=True):
