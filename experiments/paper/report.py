@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.paper.claims import (
@@ -33,8 +32,10 @@ from experiments.paper.panels import (
     in_recipe,
 )
 from experiments.paper.records import Record
-from hrlspec.evaluation.stats import interquartile_mean, mean_interval
+from hrlspec.evaluation.stats import interquartile_mean
 from hrlspec.presets import RECIPES
+from hrlspec.run.curves import band
+from hrlspec.run.figures import save
 from hrlspec.run.progress import duration
 
 _ABOUT = """\
@@ -58,8 +59,6 @@ for all claims in all panels under all recipes, {family} tests, also those whose
 or does not, where the corrected p is below {level}. Recipe `planner` is compared with the baselines under recipe
 `paper`, of which it is a variant. For claims that do not hold, experiments that look for the reason are in
 `docs/decisions.md`, "Where claims do not hold"."""
-_FEWEST_FOR_BAND = 3
-"""Student's t interval of two seeds is twelve times as wide as what they differ by."""
 
 
 def write_report(panels: Sequence[Panel], records: Mapping[Run, Record], figures: Path, report: Path) -> Iterator[Path]:
@@ -105,27 +104,22 @@ def _draw(panel: Panel, records: Records, file: Path) -> Path:
         # A method has one colour, whatever else is there yet.
         for colour, curve in enumerate(drawn[recipe]):
             if curve in records:
-                _band(ax, f"C{colour}", curve.label.rpartition(" (")[0], records[curve])
+                steps, returns = _curve(records[curve])
+                label = f"{curve.label.rpartition(' (')[0]} ({len(records[curve])})"
+                band(ax, steps, returns, color=f"C{colour}", label=label)
         ax.set_title(f"{panel.title}, recipe {recipe}", fontsize=10)
         ax.set_xlabel("million environment steps", fontsize=9)
         ax.grid(alpha=0.3)
         ax.legend(fontsize=8)
     axes[0, 0].set_ylabel("average return on unseen tasks", fontsize=9)
-    # Without the drawing library's version the same records give the same file.
-    figure.savefig(file, dpi=110, metadata={"Software": None})
-    return file
+    return save(figure, file)
 
 
-def _band(ax: Axes, colour: str, label: str, records: Sequence[Record]) -> None:
-    """Mean over seeds, and its 95 % interval by Student's t."""
+def _curve(records: Sequence[Record]) -> tuple[np.ndarray, np.ndarray]:
+    """Environment steps ``[N]`` and returns ``[S, N]``, as far as all runs go."""
     length = min(len(record.curve["env_steps"]) for record in records)
-    steps = np.array(records[0].curve["env_steps"][:length]) / 1e6
     returns = np.array([record.curve["eval/return_mean"][:length] for record in records])
-    intervals = [mean_interval(column) for column in returns.T]
-    ax.plot(steps, [interval.estimate for interval in intervals], color=colour, label=f"{label} ({len(records)})")
-    if len(records) >= _FEWEST_FOR_BAND:
-        low, high = ([getattr(interval, end) for interval in intervals] for end in ("low", "high"))
-        ax.fill_between(steps, low, high, alpha=0.2, color=colour, linewidth=0)
+    return np.array(records[0].curve["env_steps"][:length]), returns
 
 
 def _page(by_panel: Mapping[Panel, Records], figures: Path, report: Path) -> Iterator[str]:

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from hrlspec.run.errors import UserError
-from hrlspec.run.extras import check_drawing, drawing
+from hrlspec.run.extras import PICTURES, check_drawing, drawing
 from hrlspec.run.folder import check_file
 from hrlspec.spec.dfa import to_dict
 from hrlspec.spec.dot import to_dot
@@ -14,7 +14,6 @@ from hrlspec.spec.draw_automaton import MAX_DRAWN
 from hrlspec.spec.hoa import to_hoa
 from hrlspec.spec.ltl import Automaton
 
-PICTURES = (".png", ".svg")
 _ENDINGS = (".dot", ".hoa", ".json", *PICTURES)
 
 

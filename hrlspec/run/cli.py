@@ -20,6 +20,8 @@ COMMANDS = {
     "evaluate": "evaluate a trained agent on tasks of your own, or draw it",
     "replay": "a page that plays episodes of trained agents, with what they thought",
     "export": "an agent as a file of parameters and a card that says what it is",
+    "runs": "the run folders there are, and how far each has come",
+    "compare": "learning curves, results and differing settings of several runs",
     "demo": "the paper's two motivating examples, trained and drawn",
     "reproduce": "the paper's figures, in a checkout of the project",
     "peers": "agents on formulas of others, beside published results, in a checkout",

@@ -27,7 +27,7 @@ class PlainConsole(Console):
         self.print(line, soft_wrap=True)
 
 
-def result_console() -> PlainConsole:
-    """Standard output; where it is no terminal, wide enough for any table."""
+def result_console(width: int = 100) -> PlainConsole:
+    """Standard output; where it is no terminal, so many columns wide, enough for any table of results."""
     console = PlainConsole()
-    return console if console.is_terminal else PlainConsole(width=100)
+    return console if console.is_terminal else PlainConsole(width=width)

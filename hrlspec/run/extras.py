@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 from hrlspec.run.errors import UserError, in_words
+from hrlspec.run.folder import check_file
+
+PICTURES = (".png", ".svg")
+"""Endings of the files in which a picture can be."""
 
 
 @contextlib.contextmanager
@@ -32,3 +37,18 @@ def check_drawing() -> None:
     """
     with drawing():
         importlib.import_module("hrlspec.run.plots")
+
+
+def check_picture(flag: str, file: Path, endings: Sequence[str]) -> None:
+    """Refuses a picture that could not be written or drawn.
+
+    Args:
+        flag: what asks for it.
+        file: the picture.
+        endings: of files, each another format.
+
+    Raises:
+        UserError: it ends in none of them, or is a folder, or cannot be made, or a library is missing.
+    """
+    check_file(flag, file, endings)
+    check_drawing()

@@ -28,6 +28,7 @@ import platform
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
@@ -40,6 +41,7 @@ from hrlspec.version import __version__
 
 FORMAT = 1
 _LOCK = ".lock"
+_LOCK_TRIES, _LOCK_PAUSE = 20, 0.01  # seconds
 _LEFT_BY_A_KILL = {_LOCK, ".config.json.new"}  # all that a process killed at once after its start leaves
 _BEGUN = (*_LEFT_BY_A_KILL, "config.json", "tensorboard")  # what `open_run` makes
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "orbax-checkpoint")
@@ -360,7 +362,7 @@ def check_same(folder: Path, there: Any, here: Any, may_change: Sequence[str]) -
 
 def differences(there: Any, here: Any) -> dict[str, tuple[Any, Any]]:
     """Settings in which two configurations differ, by dotted names in their order: the value there, the value here."""
-    old, new = _dotted(_plain(there)), _dotted(_plain(here))
+    old, new = dotted(_plain(there)), dotted(_plain(here))
     return {
         name: (old.get(name, "nothing"), new.get(name, "nothing"))
         for name in sorted(old.keys() | new.keys())
@@ -368,15 +370,30 @@ def differences(there: Any, here: Any) -> dict[str, tuple[Any, Any]]:
     }
 
 
-def _dotted(config: Any, prefix: str = "") -> dict[str, Any]:
-    """Nested entries under dotted names."""
+def dotted(config: Any, prefix: str = "") -> dict[str, Any]:
+    """Nested entries under dotted names, such as ``config.low.clip``; lists are values."""
     if not isinstance(config, dict) or not config:
         return {prefix: config}
     return {
         name: value
         for key, inner in config.items()
-        for name, value in _dotted(inner, f"{prefix}.{key}" if prefix else key).items()
+        for name, value in dotted(inner, f"{prefix}.{key}" if prefix else key).items()
     }
+
+
+def is_being_written(folder: Path) -> bool:
+    """Whether a process holds the folder now; where the system has no such locks it looks as if none did."""
+    if sys.platform == "win32":
+        return False
+    import fcntl
+
+    # To ask is to hold it for an instant, along with any others that ask; who comes to write waits for longer.
+    with contextlib.suppress(FileNotFoundError), (folder / _LOCK).open() as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
 
 
 def _lock(file: IO[str], folder: Path) -> None:
@@ -385,10 +402,15 @@ def _lock(file: IO[str], folder: Path) -> None:
         return  # there are no such locks; the other checks hold
     import fcntl
 
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise UserError(f"another process is writing to {folder}; wait for it, or choose another --out") from error
+    for last in (*[False] * _LOCK_TRIES, True):
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except BlockingIOError as error:
+            if last:
+                message = f"another process is writing to {folder}; wait for it, or choose another --out"
+                raise UserError(message) from error
+            time.sleep(_LOCK_PAUSE)  # it may be somebody who only looks, see `is_being_written`
 
 
 def _read_rows(folder: Path) -> tuple[list[dict[str, Any]], int]:

@@ -1,4 +1,4 @@
-"""Pictures of runs: learning curves, example trajectories, task graphs, automata, one animation.
+"""Pictures of episodes: trajectories, task graphs, animations; and of automata.
 
 Axes: **B** episodes, **H** horizon.
 """
@@ -8,13 +8,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
@@ -26,6 +25,7 @@ from hrlspec.agent.low_level import Params
 from hrlspec.evaluation import Suite
 from hrlspec.evaluation.cases import draw_layouts
 from hrlspec.evaluation.episodes import Episodes, Trace, trace_episodes
+from hrlspec.run.figures import save
 from hrlspec.run.timeline import Timeline
 from hrlspec.spec import RUNNING, SATISFIED, VIOLATED, TaskState, TaskTree, draw_task, subtasks
 from hrlspec.spec.draw_automaton import draw_automaton
@@ -34,34 +34,6 @@ from hrlspec.tasks.rewards import RewardMachine
 
 _FRAME_MS, _LAST_FRAME_MS = 350, 1500
 _MOST_FRAMES = 80
-_CURVES = {
-    "eval/success_rate": "success on unseen tasks",
-    "eval/spl": "SPL on unseen tasks",
-    "eval/return_mean": "return on unseen tasks",
-    "eval/steps_mean": "steps of successful episodes",
-    "train/success_rate": "success while training",
-    "level": "curriculum level",
-}
-
-
-def learning_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], file: Path) -> Path:
-    """Draws the rows of ``metrics.jsonl`` of one run or several, each a line, and returns the PNG's path."""
-    figure = Figure(figsize=(12, 6), layout="constrained")
-    for ax, (name, title) in zip(figure.subplots(2, 3).flat, _CURVES.items(), strict=True):
-        for label, rows in runs.items():
-            points = [(row["env_steps"], row[name]) for row in rows if row.get(name) is not None]
-            if points:
-                steps, values = zip(*points, strict=True)
-                ax.plot(np.array(steps) / 1e6, values, label=label, marker="." if len(points) < 10 else None)
-        ax.set_title(title, fontsize=10)
-        ax.set_xlabel("million environment steps", fontsize=8)
-        ax.grid(alpha=0.3)
-        if "success" in name or name == "eval/spl":
-            ax.set_ylim(-0.02, 1.02)
-    if len(runs) > 1:
-        figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
-    figure.savefig(file, dpi=110, metadata={"Software": None})
-    return file
 
 
 @dataclasses.dataclass(frozen=True)
@@ -201,8 +173,7 @@ def trajectory(episode: Episode, names: Sequence[str], file: Path) -> Path:
     title = "\n".join(textwrap.wrap(episode.formula, 80))
     ax.set_title(f"{title}\n{episode.outcome}, {len(episode.assigned)} steps", fontsize=9)
     figure.legend(loc="outside right center", title="sub-tasks", fontsize=9)
-    figure.savefig(file, dpi=110, metadata={"Software": None})
-    return file
+    return save(figure, file)
 
 
 def gallery(episodes: Sequence[Episode], names: Sequence[str], file: Path) -> Path:
@@ -218,7 +189,7 @@ def gallery(episodes: Sequence[Episode], names: Sequence[str], file: Path) -> Pa
         title = "\n".join(textwrap.wrap(episode.formula, 60))
         ax.set_title(f"{title}\n{episode.outcome}, {len(episode.assigned)} steps", fontsize=9)
         ax.legend(loc="upper right", fontsize=7)
-    return _save(figure, file)
+    return save(figure, file)
 
 
 def task_graph(episode: Episode, names: Sequence[str], file: Path) -> Path:
@@ -226,22 +197,14 @@ def task_graph(episode: Episode, names: Sequence[str], file: Path) -> Path:
     status = SATISFIED if episode.success else VIOLATED if episode.violated else RUNNING
     blocked = np.zeros(episode.tree.num_nodes, bool)
     state = TaskState(node=episode.nodes[-1], blocked=blocked, status=np.int32(status))  # type: ignore[arg-type]
-    draw_task(episode.tree, names, state).savefig(file, dpi=110, metadata={"Software": None})
-    return file
+    return save(draw_task(episode.tree, names, state), file)
 
 
 def automaton_graph(automaton: Automaton, task: str, file: Path) -> Path:
     """Draws an automaton below its task; the file's ending says in which format."""
     figure = draw_automaton(automaton)
     figure.suptitle("\n".join(textwrap.wrap(task, 80)), fontsize=9)
-    return _save(figure, file)
-
-
-def _save(figure: Figure, file: Path) -> Path:
-    """The same bytes for the same picture, as PNG or SVG."""
-    with rc_context({"svg.hashsalt": file.stem}):
-        figure.savefig(file, dpi=110, metadata={"Date": None} if file.suffix == ".svg" else {"Software": None})
-    return file
+    return save(figure, file)
 
 
 def animation(episode: Episode, names: Sequence[str], file: Path) -> Path:

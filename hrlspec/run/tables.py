@@ -48,9 +48,9 @@ def suite_table(result: SuiteResult) -> Table:
     )
     for depth, score in sorted(result.per_depth.items()):
         mark = "" if few or score.intervals_over == OVER_TASKS else "*"
-        table.add_row(f"depth {depth}{mark}", *(_cell(getattr(score, name)) for name in names))
+        table.add_row(f"depth {depth}{mark}", *(cell(getattr(score, name)) for name in names))
     table.add_section()
-    table.add_row("all", *(_cell(getattr(total, name)) for name in names), style="bold")
+    table.add_row("all", *(cell(getattr(total, name)) for name in names), style="bold")
     return table
 
 
@@ -71,8 +71,8 @@ def ltl_table(result: LtlResult) -> Table:
     for score in result.per_formula:
         mark = "*" * score.cut + "†" * score.silent
         violated = f"{score.violation_rate.estimate:.3f}"
-        finite = _cell(score.success_rate), violated, _cell(score.steps_mean)
-        table.add_row(score.formula + mark, *((_cell(score.rounds_mean), violated) if result.forever else finite))
+        finite = cell(score.success_rate), violated, cell(score.steps_mean)
+        table.add_row(score.formula + mark, *((cell(score.rounds_mean), violated) if result.forever else finite))
     table.add_section()
     finite = f"{result.success_rate:.3f}", "", f"{result.steps_mean:.1f}"
     table.add_row("mean", *((f"{result.rounds_mean:.2f}",) if result.forever else finite), style="bold")
@@ -89,7 +89,7 @@ def final_tables(results: FinalResults) -> list[Table]:
             ["best first sub-task", "chance"],
             f"best by {first.by}; the decision itself is counted, whatever comes of it",
         )
-        table.add_row(_cell(first.rate), f"{first.chance:.3f}")
+        table.add_row(cell(first.rate), f"{first.chance:.3f}")
         tables.append(table)
     if results.choice is not None:
         choice = results.choice
@@ -98,7 +98,7 @@ def final_tables(results: FinalResults) -> list[Table]:
             ["right choices", "nearest is wrong", "nearest is right", "failures"],
             "always the nearest instance, or always another, scores 0.5; failures count as wrong",
         )
-        table.add_row(_cell(choice.score), _cell(choice.contested), _cell(choice.controls), f"{choice.failures:.3f}")
+        table.add_row(cell(choice.score), cell(choice.contested), cell(choice.controls), f"{choice.failures:.3f}")
         tables.append(table)
     if results.returns is not None:
         returns = results.returns
@@ -106,7 +106,7 @@ def final_tables(results: FinalResults) -> list[Table]:
             f"Return over optimum where the branch matters ({returns.episodes} cases)",
             ["agent", "random branch", "longest branch"],
         )
-        table.add_row(_cell(returns.ratio), f"{returns.random_branch:.3f}", f"{returns.longest_branch:.3f}")
+        table.add_row(cell(returns.ratio), f"{returns.random_branch:.3f}", f"{returns.longest_branch:.3f}")
         tables.append(table)
     return tables
 
@@ -121,7 +121,7 @@ def aggregate_table(name: str, aggregates: Mapping[str, Aggregate]) -> Table:
     for key, title in _NAMES.items():
         if key in aggregates:
             value = aggregates[key]
-            table.add_row(title, str(value.runs), _cell(value.mean), _cell(value.iqm))
+            table.add_row(title, str(value.runs), cell(value.mean), cell(value.iqm))
     return table
 
 
@@ -133,7 +133,7 @@ def plain_table(title: str, columns: Sequence[str], caption: str | None = None) 
     return table
 
 
-def _cell(interval: Interval | None) -> str:
+def cell(interval: Interval | None) -> str:
     """The estimate and its bounds, such as ``0.983 [.97,.99]``."""
     if interval is None or math.isnan(interval.estimate):
         return "-"

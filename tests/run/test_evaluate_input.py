@@ -34,7 +34,7 @@ BAD_FLAGS: list[tuple[Sequence[str], str]] = [
     (("--run", "foreign", "--suite", "dag"), "holds another state"),
     (("--run", "foreign", "--suite", "dag", "--step", "5"), "no checkpoint of step 5"),
     (("--run", "run", "--suite", "cats"), "unknown suite 'cats' of 'letter'"),
-    (("--run", "run", "--suite", "dag", "--draw", "way.gif"), "--draw way.gif: expected a file that ends in .png"),
+    (("--run", "run", "--suite", "dag", "--draw", "way.pdf"), "--draw way.pdf: expected a file that ends in .png"),
     (("--run", "run", "--suite", "dag", "--draw", "folder.png"), "--draw folder.png: expected a file, found a folder"),
     (("--run", "run", "--suite", "dag", "--draw", "file/x.png"), "cannot write to file: "),
     (("--run", "run", "--spec", ""), "found no formula"),

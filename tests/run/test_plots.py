@@ -106,15 +106,6 @@ def test_an_animation_has_a_frame_for_each_state(episode: Episode, tmp_path: Pat
     assert all((first != second).any() for first, second in itertools.pairwise(frames))
 
 
-def test_learning_curves_of_several_runs(tmp_path: Path) -> None:
-    rows = [{"env_steps": step, "eval/success_rate": step / 100, "eval/spl": None, "level": 1} for step in (0, 50, 100)]
-    one, two = tmp_path / "one.png", tmp_path / "two.png"
-    assert plots.learning_curves({"a": rows}, one) == one
-    plots.learning_curves({"a": rows, "b": rows[:2]}, two)
-    plots.learning_curves({"a": []}, tmp_path / "none.png")
-    assert one.read_bytes() != two.read_bytes()
-
-
 @pytest.mark.parametrize("name", ["walk", "flatworld", "zone"])
 def test_worlds_of_discs_are_drawn_from_above(name: str, tmp_path: Path) -> None:
     """A long straight line: fewer frames than steps, every sub-task named, goals where regions are."""

@@ -188,6 +188,7 @@ def draw(demo: Demo, shown: dict[str, Shown], file: Path) -> Path:
     from matplotlib.figure import Figure
 
     from hrlspec.run import plots
+    from hrlspec.run.figures import save
 
     steps_of_ways = [*ways(demo, shown).values()]
     index = int(np.argmax(steps_of_ways[-1] - steps_of_ways[0])) if steps_of_ways else 0
@@ -200,8 +201,7 @@ def draw(demo: Demo, shown: dict[str, Shown], file: Path) -> Path:
         ax.set_title(f"{method}: {int(ended.steps)} steps, return {float(ended.returns):g}", fontsize=10)
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), fontsize=7)
     figure.suptitle(demo.task, fontsize=10)
-    figure.savefig(file, dpi=110, metadata={"Software": None})
-    return file
+    return save(figure, file)
 
 
 DEMOS = {

@@ -33,12 +33,11 @@ from hrlspec.evaluation.suite import MAX_NODES
 from hrlspec.presets import Preset
 from hrlspec.presets.peers import go_on_for_ever, peer_formulas
 from hrlspec.run import platform
-from hrlspec.run.automaton_file import PICTURES, check_automaton, check_automaton_file, write_automaton
+from hrlspec.run.automaton_file import check_automaton, check_automaton_file, write_automaton
 from hrlspec.run.console import result_console
 from hrlspec.run.errors import UserError
-from hrlspec.run.extras import check_drawing, drawing
+from hrlspec.run.extras import PICTURES, check_picture, drawing
 from hrlspec.run.flags import parse_flags
-from hrlspec.run.folder import check_file
 from hrlspec.run.tables import ltl_table, suite_table
 from hrlspec.run.trained import Source, find_trained
 from hrlspec.spec import SpecError, bare_lines
@@ -278,5 +277,4 @@ def _check(flags: EvaluateFlags) -> None:
     if flags.automaton is not None:
         check_automaton_file("--automaton", flags.automaton)
     if flags.draw is not None:
-        check_file("--draw", flags.draw, PICTURES)
-        check_drawing()
+        check_picture("--draw", flags.draw, PICTURES)

@@ -226,8 +226,9 @@ def _draw(learner: Learner, run: RunFolder, params: Any) -> Iterator[Path]:
     """
     with drawing():
         from hrlspec.run import plots
+        from hrlspec.run.curves import learning_curves
 
-        yield plots.learning_curves({learner.experiment.name: read_metrics(run.path)}, run.plots / "curves.png")
+        yield learning_curves({learner.experiment.name: [read_metrics(run.path)]}, run.plots / "curves.png")
         yield from plots.examples(
             jax.random.key(learner.experiment.seed),
             learner.agent,
