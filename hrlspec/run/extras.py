@@ -52,3 +52,15 @@ def check_picture(flag: str, file: Path, endings: Sequence[str]) -> None:
     """
     check_file(flag, file, endings)
     check_drawing()
+    if file.suffix == ".mp4":
+        _check_video()
+
+
+def _check_video() -> None:
+    """Looks for the encoder of videos."""
+    try:
+        importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe()
+    except ImportError as error:
+        raise UserError('videos (.mp4) need the extra "video": pip install "hrlspec[video]"') from error
+    except RuntimeError as error:
+        raise UserError(f"no encoder of videos (.mp4): {in_words(error)}") from error

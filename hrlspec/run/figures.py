@@ -1,7 +1,9 @@
-"""Figures as files: the same figure gives the same bytes, and no reader ever meets half of one."""
+"""Pictures as files: the same figure gives the same bytes, and no reader ever meets half of one."""
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 
 from matplotlib import rc_context
@@ -18,13 +20,19 @@ def save(figure: Figure, file: Path) -> Path:
     Raises:
         OSError: it cannot be written; an earlier one stays.
     """
-    temporary = file.with_name(f".{file.name}.new")
-    kind = file.suffix.removeprefix(".")
-    try:
-        # Neither the drawing library's version, nor the date, nor names drawn at random.
-        with rc_context({"svg.hashsalt": file.stem}):
-            figure.savefig(temporary, format=kind, dpi=110, metadata={"Date" if kind == "svg" else "Software": None})
-        temporary.replace(file)
-    finally:
-        temporary.unlink(missing_ok=True)
+    metadata = {"Date" if file.suffix == ".svg" else "Software": None}
+    # Neither the drawing library's version, nor the date, nor names drawn at random.
+    with replacing(file) as new, rc_context({"svg.hashsalt": file.stem}):
+        figure.savefig(new, dpi=110, metadata=metadata)
     return file
+
+
+@contextlib.contextmanager
+def replacing(file: Path) -> Iterator[Path]:
+    """A file with the same ending beside it, which takes its place when the context ends without an exception."""
+    new = file.with_name(f".{file.stem}.new{file.suffix}")
+    try:
+        yield new
+        new.replace(file)
+    finally:
+        new.unlink(missing_ok=True)

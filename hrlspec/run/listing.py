@@ -93,8 +93,10 @@ def look_at(folder: Path) -> FoundRun:
         return nothing
 
     running = part(is_being_written, False)
-    record, rows, summary = part(read_record, {}), part(read_metrics, []), part(read_summary, None)
-    saved = part(lambda folder: checkpoint.steps(folder / "checkpoints"), [])
+    record: Mapping[str, Any] = part(read_record, {})
+    rows: Sequence[Mapping[str, Any]] = part(read_metrics, [])
+    summary: Mapping[str, Any] | None = part(read_summary, None)
+    saved: Sequence[int] = part(lambda folder: checkpoint.steps(folder / "checkpoints"), [])
     state: State = "stopped"
     if damage:
         state = "damaged"

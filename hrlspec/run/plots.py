@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import io
+import subprocess
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,7 +27,7 @@ from hrlspec.agent.low_level import Params
 from hrlspec.evaluation import Suite
 from hrlspec.evaluation.cases import draw_layouts
 from hrlspec.evaluation.episodes import Episodes, Trace, trace_episodes
-from hrlspec.run.figures import save
+from hrlspec.run.figures import replacing, save
 from hrlspec.run.timeline import Timeline
 from hrlspec.spec import RUNNING, SATISFIED, VIOLATED, TaskState, TaskTree, draw_task, subtasks
 from hrlspec.spec.draw_automaton import draw_automaton
@@ -114,7 +116,7 @@ def examples(
         files += [folder / f"example_{depth}.png", folder / f"task_{depth}.png"]
         trajectory(episode, names, files[-2])
         task_graph(episode, names, files[-1])
-    return [*files, animation(shown[-1], names, folder / "episode.gif")]
+    return [*files, animation(shown[-1:], names, folder / "episode.gif")]
 
 
 def episodes_of(key: jax.Array, agent: Agent, params: Params, machine: RewardMachine, suite: Suite) -> list[Episode]:
@@ -207,22 +209,58 @@ def automaton_graph(automaton: Automaton, task: str, file: Path) -> Path:
     return save(figure, file)
 
 
-def animation(episode: Episode, names: Sequence[str], file: Path) -> Path:
-    """The episode as a GIF, the sub-task in force below; of a long one every so many steps."""
+def animation(episodes: Sequence[Episode], names: Sequence[str], file: Path) -> Path:
+    """Episodes one after the other, the sub-task in force below; of a long one every so many steps.
+
+    Args:
+        episodes: at least one, all in one environment.
+        names: of the propositions.
+        file: a GIF, or a video if it ends in .mp4.
+    """
+    frames: list[Image.Image] = []
+    durations: list[int] = []
+    for number, episode in enumerate(episodes, start=1):
+        some = _frames(episode, names, f"task {number}, " if len(episodes) > 1 else "")
+        pause = _FRAME_MS if len(some) == len(episode.positions) else _FRAME_MS // 4
+        frames += some
+        durations += [pause] * (len(some) - 1) + [_LAST_FRAME_MS]
+    gif = io.BytesIO()
+    frames[0].save(gif, format="GIF", save_all=True, append_images=frames[1:], duration=durations, loop=0)
+    with replacing(file) as new:
+        if file.suffix == ".mp4":
+            _encode(gif.getvalue(), new)
+        else:
+            new.write_bytes(gif.getvalue())
+    return file
+
+
+def _frames(episode: Episode, names: Sequence[str], before: str) -> list[Image.Image]:
     legs, last = episode.legs(names), len(episode.positions) - 1
     stride = -(-len(episode.positions) // _MOST_FRAMES)
-    times = [*range(0, last, stride), last]
     frames = []
-    for t in times:
+    for t in (*range(0, last, stride), last):
         leg = next((leg for leg in legs if leg.first <= t <= leg.last), None)
         picture = episode.scene.frame(episode.positions, t, leg)
-        caption = f"step {t}: {leg.label if leg else episode.outcome}"
+        caption = f"{before}step {t}: {leg.label if leg else episode.outcome}"
         frame = Image.new("RGB", (picture.shape[1], picture.shape[0] + 28), "white")
         frame.paste(Image.fromarray(picture), (0, 0))
         ImageDraw.Draw(frame).text((8, picture.shape[0] + 6), caption, fill="black", font_size=15)
         # A palette without dithering keeps the file small and the colours flat.
         frames.append(frame.quantize(64, dither=Image.Dither.NONE))
-    pause = _FRAME_MS if stride == 1 else _FRAME_MS // 4
-    durations = [pause] * (len(frames) - 1) + [_LAST_FRAME_MS]
-    frames[0].save(file, save_all=True, append_images=frames[1:], duration=durations, loop=0)
-    return file
+    return frames
+
+
+def _encode(gif: bytes, file: Path) -> None:
+    """Writes an animation as a video.
+
+    Raises:
+        OSError: the encoder says that it cannot.
+    """
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    # The format that every player knows takes even sizes alone.
+    picture = "fps=25,pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white", "-pix_fmt", "yuv420p"
+    command = [get_ffmpeg_exe(), "-v", "error", "-y", "-f", "gif", "-i", "-", "-vf", *picture, str(file)]
+    ended = subprocess.run(command, input=gif, capture_output=True, check=False)
+    if ended.returncode:
+        raise OSError(ended.stderr.decode(errors="replace"))

@@ -34,7 +34,10 @@ BAD_FLAGS: list[tuple[Sequence[str], str]] = [
     (("--run", "foreign", "--suite", "dag"), "holds another state"),
     (("--run", "foreign", "--suite", "dag", "--step", "5"), "no checkpoint of step 5"),
     (("--run", "run", "--suite", "cats"), "unknown suite 'cats' of 'letter'"),
-    (("--run", "run", "--suite", "dag", "--draw", "way.pdf"), "--draw way.pdf: expected a file that ends in .png"),
+    (
+        ("--run", "run", "--suite", "dag", "--draw", "way.pdf"),
+        "--draw way.pdf: expected a file that ends in .png, .svg, .gif or .mp4",
+    ),
     (("--run", "run", "--suite", "dag", "--draw", "folder.png"), "--draw folder.png: expected a file, found a folder"),
     (("--run", "run", "--suite", "dag", "--draw", "file/x.png"), "cannot write to file: "),
     (("--run", "run", "--spec", ""), "found no formula"),
@@ -126,6 +129,16 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "empty").write_text("# nothing\n\n")
     (folder / "wrong").write_text("# tasks\nachieve a\nachieve )\n")
     return folder
+
+
+def test_videos_need_their_library(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)  # as if it was not installed
+    monkeypatch.chdir(place)
+    assert main_guard(lambda: evaluate.main(["--run", "run", "--suite", "dag", "--draw", "way.mp4"])) == 2
+    expected = 'error: videos (.mp4) need the extra "video": pip install "hrlspec[video]"\n'
+    assert capsys.readouterr().err == expected
 
 
 def contents(folder: Path) -> dict[str, bytes]:

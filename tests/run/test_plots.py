@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import subprocess
 from pathlib import Path
 
 import jax
@@ -94,7 +95,7 @@ def test_a_task_graph(episode: Episode, tmp_path: Path) -> None:
 
 
 def test_an_animation_has_a_frame_for_each_state(episode: Episode, tmp_path: Path) -> None:
-    with Image.open(plots.animation(episode, NAMES, tmp_path / "e.gif")) as image:
+    with Image.open(plots.animation([episode], NAMES, tmp_path / "e.gif")) as image:
         assert image.format == "GIF"
         assert image.n_frames == len(episode.positions)
         frames = []
@@ -104,6 +105,43 @@ def test_an_animation_has_a_frame_for_each_state(episode: Episode, tmp_path: Pat
     size = 5 * 48
     assert all(frame.shape == (size + 28, size, 3) for frame in frames)
     assert all((first != second).any() for first, second in itertools.pairwise(frames))
+
+
+def test_animations_of_several_episodes_follow_each_other(episode: Episode, tmp_path: Path) -> None:
+    with Image.open(plots.animation([episode, episode], NAMES, tmp_path / "e.gif")) as image:
+        assert image.n_frames == 2 * len(episode.positions)
+        pauses = []
+        for i in range(image.n_frames):
+            image.seek(i)
+            pauses.append(image.info["duration"])
+    assert pauses == [*[350] * 4, 1500] * 2
+
+
+def test_a_video_shows_what_the_animation_does(episode: Episode, tmp_path: Path) -> None:
+    """Read back: each state for as long, in nearly the same colours."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
+    gif = plots.animation([episode], NAMES, tmp_path / "e.gif")
+    video = plots.animation([episode], NAMES, tmp_path / "e.mp4")
+    assert sorted(tmp_path.iterdir()) == [gif, video]
+    read = [ffmpeg, "-v", "error", "-i", str(video), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    content = subprocess.run(read, capture_output=True, check=True).stdout
+    with Image.open(gif) as image:
+        stills = []
+        for i in range(image.n_frames):
+            image.seek(i)
+            stills.append(np.asarray(image.convert("RGB"), int))
+    frames = np.frombuffer(content, np.uint8).reshape(-1, *stills[0].shape).astype(int)
+    assert len(frames) == pytest.approx(25 * (4 * 0.35 + 1.5), abs=1)
+    for number, frame in enumerate(frames):
+        differences = [np.abs(frame - still).mean() for still in stills]
+        assert np.argmin(differences) == pytest.approx(min(number / 25 / 0.35, 4), abs=1)
+        assert min(differences) < 4
+
+
+def test_what_the_encoder_says_is_told(tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    with pytest.raises(OSError, match="Error opening input"):
+        plots._encode(b"no animation", tmp_path / "e.mp4")
 
 
 @pytest.mark.parametrize("name", ["walk", "flatworld", "zone"])
@@ -127,7 +165,7 @@ def test_worlds_of_discs_are_drawn_from_above(name: str, tmp_path: Path) -> None
     assert [leg.label for leg in episode.legs(names)] == [f"1. {names[0]}", f"2. {names[1]}, avoiding {names[2]}"]
     with Image.open(plots.trajectory(episode, names, tmp_path / "t.png")) as image:
         assert len(np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0)) > 20
-    with Image.open(plots.animation(episode, names, tmp_path / "e.gif")) as image:
+    with Image.open(plots.animation([episode], names, tmp_path / "e.gif")) as image:
         assert 50 < image.n_frames <= 81
 
 

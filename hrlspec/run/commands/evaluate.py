@@ -48,6 +48,7 @@ from hrlspec.spec.readings import committed_automaton
 
 MOST_PICTURES = 9
 _TASKS = ("spec", "spec_file", "ltl", "ltl_file", "hoa", "dfa", "suite")
+_MOVING = (".gif", ".mp4")
 _LARGEST_FILE = 1_000_000  # bytes
 
 
@@ -95,7 +96,7 @@ class EvaluateFlags(Checked):
     max_nodes: int = setting(MAX_NODES, least=2, most=4096)
     """Largest task tree. Trees of automata are cut at 64 nodes, or fewer."""
     draw: Path | None = None
-    """A picture (.png or .svg) of one episode of each task, of the first nine."""
+    """A picture (.png or .svg), or an animation (.gif or .mp4), of one episode of each task, of the first nine."""
     automaton: Path | None = None
     """The automaton of the one task, with short guards as a picture (.png or .svg) or for Graphviz (.dot), or to be
     read again: .hoa for --hoa, .json for --dfa."""
@@ -168,7 +169,8 @@ def _draw(flags: EvaluateFlags, trained: TrainedAgent, suite: Suite) -> None:
     agent, key = trained.agent, jax.random.key(flags.seed)
     episodes = plots.episodes_of(key, agent, trained.params, trained.rewards, some)
     flags.draw.parent.mkdir(parents=True, exist_ok=True)
-    plots.gallery(episodes, agent.env.propositions, flags.draw)
+    draw = plots.animation if flags.draw.suffix in _MOVING else plots.gallery
+    draw(episodes, agent.env.propositions, flags.draw)
 
 
 def _automaton_of(file: Path, tasks: Suite | LtlSuite, preset: Preset) -> Automaton:
@@ -277,4 +279,4 @@ def _check(flags: EvaluateFlags) -> None:
     if flags.automaton is not None:
         check_automaton_file("--automaton", flags.automaton)
     if flags.draw is not None:
-        check_picture("--draw", flags.draw, PICTURES)
+        check_picture("--draw", flags.draw, (*PICTURES, *_MOVING))
