@@ -7,7 +7,7 @@ import struct
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from tensorboardX.proto import event_pb2, summary_pb2
 from tensorboardX.record_writer import masked_crc32c
@@ -45,6 +45,12 @@ class EventFile:
                     stream.write(event)
             except OSError:
                 self._lost = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Nothing is left to do: each record was written when it was added."""
 
 
 def _event(**parts: Any) -> bytes:

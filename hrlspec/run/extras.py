@@ -64,3 +64,19 @@ def _check_video() -> None:
         raise UserError('videos (.mp4) need the extra "video": pip install "hrlspec[video]"') from error
     except RuntimeError as error:
         raise UserError(f"no encoder of videos (.mp4): {in_words(error)}") from error
+
+
+def check_wandb() -> None:
+    """Loads the library of Weights & Biases.
+
+    Raises:
+        UserError: it is missing, or cannot be used.
+    """
+    try:
+        # A folder that W&B has left here, named wandb, is to Python a module without anything in it.
+        if importlib.import_module("wandb").__file__ is None:
+            raise ImportError("a folder, not the library")
+    except ImportError as error:
+        raise UserError('--wandb needs the extra "wandb": pip install "hrlspec[wandb]"') from error
+    except Exception as error:  # as where a library that it needs is too old
+        raise UserError(f"--wandb: the library cannot be used: {in_words(error)}") from error

@@ -1,13 +1,13 @@
-"""Pictures as files: the same figure gives the same bytes, and no reader ever meets half of one."""
+"""Figures as files: the same figure gives the same bytes."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from pathlib import Path
 
 from matplotlib import rc_context
 from matplotlib.figure import Figure
+
+from hrlspec.run.files import replacing
 
 
 def save(figure: Figure, file: Path) -> Path:
@@ -25,14 +25,3 @@ def save(figure: Figure, file: Path) -> Path:
     with replacing(file) as new, rc_context({"svg.hashsalt": file.stem}):
         figure.savefig(new, dpi=110, metadata=metadata)
     return file
-
-
-@contextlib.contextmanager
-def replacing(file: Path) -> Iterator[Path]:
-    """A file with the same ending beside it, which takes its place when the context ends without an exception."""
-    new = file.with_name(f".{file.stem}.new{file.suffix}")
-    try:
-        yield new
-        new.replace(file)
-    finally:
-        new.unlink(missing_ok=True)

@@ -5,7 +5,8 @@
     config.json      everything resolved, versions, commit, command; under "earlier" those of the processes before
     metrics.jsonl    one JSON object for each evaluation, in the order of env_steps
     checkpoints/     see hrlspec.checkpoint.store
-    tensorboard/     event files with the same numbers as metrics.jsonl
+    tensorboard/     event files with the same numbers as metrics.jsonl, and those of the final results
+    wandb.json       project and id in Weights & Biases, if it is told as well; wandb/ what it keeps here
     plots/           pictures
     tasks/           test tasks, where the environment has no suites of its own
     summary.json     the final results; summary-<env_steps>.json those before it was made longer
@@ -31,20 +32,34 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Protocol, Self
 
 import jax
 import numpy as np
 
 from hrlspec.run.errors import UserError
+from hrlspec.run.files import write_atomically
 from hrlspec.version import __version__
 
 FORMAT = 1
 _LOCK = ".lock"
 _LOCK_TRIES, _LOCK_PAUSE = 20, 0.01  # seconds
-_LEFT_BY_A_KILL = {_LOCK, ".config.json.new"}  # all that a process killed at once after its start leaves
-_BEGUN = (*_LEFT_BY_A_KILL, "config.json", "tensorboard")  # what `open_run` makes
+_LEFT_BY_A_KILL = {_LOCK, ".config.new.json"}  # all that a process killed at once after its start leaves
+_BEGUN = (*_LEFT_BY_A_KILL, "config.json", "tensorboard", "wandb", "wandb.json")  # what `open_run` makes
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "orbax-checkpoint")
+
+
+class Recorder(Protocol):
+    """Whoever is told a run's numbers beside the folder itself; a context manager that ends when the run is left."""
+
+    def add(self, step: int, values: Mapping[str, float]) -> None:
+        """Adds numbers under their names. It raises nothing: what is lost is no reason to stop a run."""
+
+    def __enter__(self) -> Self:
+        """Begins, or goes on."""
+
+    def __exit__(self, *exception: object) -> None:
+        """Ends."""
 
 
 @dataclasses.dataclass
@@ -65,8 +80,10 @@ class RunFolder:
     earlier_hashes: frozenset[str]
     resumed: bool
     _tensorboard: bool
+    _wandb: str | None
+    _stack: contextlib.ExitStack
     _last_step: int | None = None  # of metrics.jsonl; None until a resumed run says where it resumes
-    _events: Any = None
+    _recorders: list[Recorder] = dataclasses.field(default_factory=list)
 
     @property
     def checkpoints(self) -> Path:
@@ -93,12 +110,12 @@ class RunFolder:
         kept = [row for row in rows if row["env_steps"] <= env_steps]
         dropped += len(rows) - len(kept)
         if dropped:
-            _write_atomically(self.path / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in kept))
+            write_atomically(self.path / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in kept))
         self._begin(env_steps)
         return dropped
 
     def append(self, row: Mapping[str, Any]) -> None:
-        """Adds one evaluation to ``metrics.jsonl``, on the disk when this returns, and its numbers to TensorBoard.
+        """Adds one evaluation to ``metrics.jsonl``, on the disk when this returns, and tells its numbers.
 
         Args:
             row: ``env_steps`` and any JSON-like values; numpy and JAX scalars and arrays become numbers and lists, and
@@ -116,30 +133,51 @@ class RunFolder:
             file.write(json.dumps(plain, allow_nan=False) + "\n")
             file.flush()
             os.fsync(file.fileno())
-        if self._events is not None:
-            numbers = {name: value for name, value in plain.items() if isinstance(value, int | float)}
-            self._events.add(numbers.pop("env_steps"), numbers)
+        self.tell(plain.pop("env_steps"), plain)
+
+    def tell(self, env_steps: int, values: Mapping[str, Any]) -> None:
+        """Tells TensorBoard, and Weights & Biases if asked to, what is a number; nested ones under names with slashes.
+
+        Args:
+            env_steps: to which they belong.
+            values: any JSON-like values.
+        """
+        numbers = {
+            name.replace(".", "/"): value
+            for name, value in dotted(_plain(values)).items()
+            if isinstance(value, int | float) and not isinstance(value, bool)
+        }
+        for recorder in self._recorders:
+            recorder.add(env_steps, numbers)
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """Writes ``summary.json``, replacing an earlier one as a whole; it has an entry ``env_steps``."""
-        _write_atomically(self.path / "summary.json", json.dumps(_plain(summary), indent=2, allow_nan=False) + "\n")
+        write_atomically(self.path / "summary.json", json.dumps(_plain(summary), indent=2, allow_nan=False) + "\n")
 
     def write_tasks(self, name: str, text: str) -> None:
         """Writes a test suite."""
         folder = self.path / "tasks"
         folder.mkdir(exist_ok=True)
-        _write_atomically(folder / f"{name}.txt", text)
+        write_atomically(folder / f"{name}.txt", text)
 
     def _begin(self, env_steps: int) -> None:
         """Accepts rows from ``env_steps`` on; TensorBoard is told to forget what an earlier process wrote after it."""
         self._last_step = env_steps
-        if not self._tensorboard:
-            return
-        try:
-            from hrlspec.run.events import EventFile
-        except ImportError as error:
-            raise UserError('TensorBoard event files need the extra "cli": pip install "hrlspec[cli]"') from error
-        self._events = EventFile(self.path / "tensorboard", env_steps + 1 if self.resumed else None)
+        if self._tensorboard:
+            try:
+                from hrlspec.run.events import EventFile
+            except ImportError as error:
+                raise UserError('TensorBoard event files need the extra "cli": pip install "hrlspec[cli]"') from error
+            self._record(EventFile(self.path / "tensorboard", env_steps + 1 if self.resumed else None))
+        if self._wandb is not None:
+            try:
+                from hrlspec.run.weights_and_biases import WandbRun
+            except ImportError as error:
+                raise UserError('--wandb needs the extra "wandb": pip install "hrlspec[wandb]"') from error
+            self._record(WandbRun(self.path, self._wandb, self.config))
+
+    def _record(self, recorder: Recorder) -> None:
+        self._recorders.append(self._stack.enter_context(recorder))
 
 
 @contextlib.contextmanager
@@ -150,6 +188,7 @@ def open_run(
     resume: bool = False,
     may_change: Sequence[str] = (),
     tensorboard: bool = True,
+    wandb: str | None = None,
 ) -> Iterator[RunFolder]:
     """Makes a run folder, or opens that of a run to be resumed, and locks it until the context ends.
 
@@ -159,13 +198,15 @@ def open_run(
         resume: continue the run that the folder holds.
         may_change: dotted names of the configuration in which a resumed run may differ, such as ``total_steps``.
         tensorboard: whether rows also go to TensorBoard event files.
+        wandb: the project in Weights & Biases to which they go too; ``None`` for none.
 
     Raises:
-        UserError: the folder holds another run, or none to resume, or is in use, or cannot be written.
+        UserError: the folder holds another run, or none to resume, or is in use, or cannot be written, or Weights &
+            Biases cannot be told.
     """
     with contextlib.ExitStack() as stack:
         with _refusals_told(Path(path)):
-            run = _open(stack, Path(path), config, resume, may_change, tensorboard)
+            run = _open(stack, Path(path), config, resume, may_change, tensorboard, wandb)
         yield run
 
 
@@ -237,7 +278,13 @@ def _refusals_told(folder: Path) -> Iterator[None]:
 
 
 def _open(
-    stack: contextlib.ExitStack, folder: Path, config: Any, resume: bool, may_change: Sequence[str], tensorboard: bool
+    stack: contextlib.ExitStack,
+    folder: Path,
+    config: Any,
+    resume: bool,
+    may_change: Sequence[str],
+    tensorboard: bool,
+    wandb: str | None,
 ) -> RunFolder:
     """`open_run` up to the point where the caller takes over; what must be undone goes on the stack."""
     resolved = _plain(config)
@@ -252,9 +299,9 @@ def _open(
         record = {"format": FORMAT, "config": resolved, "config_hash": config_hash(resolved), **circumstances()}
         if resume:
             record["earlier"] = _replaced(folder, resolved, may_change)
-        _write_atomically(folder / "config.json", json.dumps(record, indent=2) + "\n")
+        write_atomically(folder / "config.json", json.dumps(record, indent=2) + "\n")
         earlier = frozenset(entry["config_hash"] for entry in record.get("earlier", []) if "config_hash" in entry)
-        run = RunFolder(folder, resolved, record["config_hash"], earlier, resume, tensorboard)
+        run = RunFolder(folder, resolved, record["config_hash"], earlier, resume, tensorboard, wandb, stack)
         if not resume:
             run._begin(-1)
         undo.pop_all()
@@ -475,17 +522,3 @@ def current_commit() -> str | None:
         return git("rev-parse", "HEAD") + ("+changes" if git("status", "--porcelain", "--untracked-files=no") else "")
     except (OSError, subprocess.SubprocessError):
         return None
-
-
-def _write_atomically(file: Path, text: str) -> None:
-    """Replaces a file so that no reader and no kill ever meets half of it."""
-    temporary = file.with_name(f".{file.name}.new")
-    try:
-        with temporary.open("w", encoding="utf-8") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
-        temporary.replace(file)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise

@@ -27,7 +27,8 @@ from hrlspec.agent.low_level import Params
 from hrlspec.evaluation import Suite
 from hrlspec.evaluation.cases import draw_layouts
 from hrlspec.evaluation.episodes import Episodes, Trace, trace_episodes
-from hrlspec.run.figures import replacing, save
+from hrlspec.run.figures import save
+from hrlspec.run.files import replacing
 from hrlspec.run.timeline import Timeline
 from hrlspec.spec import RUNNING, SATISFIED, VIOLATED, TaskState, TaskTree, draw_task, subtasks
 from hrlspec.spec.draw_automaton import draw_automaton

@@ -59,6 +59,9 @@ class RunFlags(Checked):
     as many as there are. Results do not depend on it."""
     checkpoint_minutes: float = setting(1.0, least=0, most=1e6)
     """How much work a kill may cost."""
+    wandb: str | None = None
+    """A project in Weights & Biases that is told all numbers too; with WANDB_MODE=offline they stay in the run folder.
+    A resumed run goes on there if the flag is given again."""
     no_max_operator: bool = False
     """Targets of the low level without the planner's value of what remains."""
     no_shield: bool = False

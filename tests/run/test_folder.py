@@ -333,6 +333,6 @@ def test_two_processes_never_write_the_same_folder(tmp_path: Path) -> None:
 
 def test_a_process_killed_at_its_start_leaves_nothing_in_the_way(tmp_path: Path) -> None:
     (tmp_path / ".lock").touch()
-    (tmp_path / ".config.json.new").write_text("{")
+    (tmp_path / ".config.new.json").write_text("{")
     with open_run(tmp_path, Config()) as run:
         assert not run.resumed

@@ -21,7 +21,7 @@ from hrlspec.run import platform
 from hrlspec.run.console import PlainConsole, result_console
 from hrlspec.run.errors import UserError
 from hrlspec.run.experiment import Experiment, experiment_of
-from hrlspec.run.extras import drawing
+from hrlspec.run.extras import check_wandb, drawing
 from hrlspec.run.folder import (
     RunFolder,
     check_place,
@@ -58,6 +58,8 @@ def main(argv: Sequence[str], *, program: str = "hrlspec run") -> None:
     """
     flags = parse_run(argv, program=program)
     runs = experiments_of(flags)
+    if flags.wandb is not None:
+        check_wandb()
     resumed = _check_folders(runs, flags)
     given = None if flags.from_ is None else _file_that_fits(flags.from_, runs[0][0])
     devices = _devices(flags, runs[0][0].config.blocks)
@@ -156,7 +158,7 @@ def _run(
     before = experiment_of(read_record(folder)["config"], str(folder)) if resume else experiment
     preset = with_tasks(experiment.preset, folder, experiment.seed)
     learner = Learner(experiment, preset, devices, params)
-    with open_run(folder, experiment, resume=resume, may_change=_may_change(flags)) as run:
+    with open_run(folder, experiment, resume=resume, may_change=_may_change(flags), wandb=flags.wandb) as run:
         # Suite dag comes last: where it is there all are.
         for name, text in sorted(preset.texts.items(), reverse=True):
             run.write_tasks(name, text)
@@ -203,6 +205,7 @@ def _finish(
         "final": results.to_json(),
     }
     run.write_summary(summary)
+    run.tell(env_steps, {"final": results.to_json()})
     for table in final_tables(results):
         console.print(table)
     pictures = []
