@@ -29,11 +29,11 @@ from hrlspec.run.folder import (
     differences,
     holds_run,
     open_run,
-    read_metrics,
     read_record,
     read_summary,
 )
 from hrlspec.run.learner import Learner, on_one_device
+from hrlspec.run.live_curves import CURVES, LiveCurves, draw_curves
 from hrlspec.run.loop import DivergedError, Loop, UnsavedError
 from hrlspec.run.progress import ProgressDisplay, duration
 from hrlspec.run.run_flags import RunFlags, experiments_of, parse_run, schedules_moved
@@ -165,7 +165,8 @@ def _run(
         job = learner.job()
         total = job.num_iterations * job.steps_per_iteration
         with ProgressDisplay(total, experiment.name) as display:
-            loop = Loop(job, run, display, checkpoint_seconds=60 * flags.checkpoint_minutes)
+            watched = LiveCurves(display, run, experiment.name)
+            loop = Loop(job, run, watched, checkpoint_seconds=60 * flags.checkpoint_minutes)
             state = loop.restore()
             if loop.position.done:
                 display.note(_continuing(experiment, before, loop.position.done))
@@ -229,9 +230,9 @@ def _draw(learner: Learner, run: RunFolder, params: Any) -> Iterator[Path]:
     """
     with drawing():
         from hrlspec.run import plots
-        from hrlspec.run.curves import learning_curves
 
-        yield learning_curves({learner.experiment.name: [read_metrics(run.path)]}, run.plots / "curves.png")
+        draw_curves(run, learner.experiment.name)
+        yield run.plots / CURVES
         yield from plots.examples(
             jax.random.key(learner.experiment.seed),
             learner.agent,
