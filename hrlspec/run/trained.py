@@ -71,6 +71,16 @@ def find_trained(run: Path | None, pretrained: str | None, step: int | None) -> 
     return _in_run(run, step)
 
 
+def check_shield(trained: TrainedAgent) -> None:
+    """Whether an agent can be shielded.
+
+    Raises:
+        UserError: it has no reach critic.
+    """
+    if "reach_critic" not in trained.params:
+        raise UserError("--shield needs the reach critic of an agent that was trained with a shield; this one was not")
+
+
 def find_file(name: str) -> AgentFile:
     """An agent in a file.
 

@@ -146,14 +146,14 @@ ONE = ("--run", "run")
 TO = ("--out", "page.html")
 BAD_FLAGS: list[tuple[Sequence[str], str]] = [
     ((*ONE, "--spec", "achieve a"), "--out"),
-    ((*TO, "--spec", "achieve a"), "expected one --run, or two different ones, found none"),
+    ((*TO, "--spec", "achieve a"), "expected one --run or --pretrained, or two different ones, found none"),
     ((*TO, *ONE), "expected either --spec or --ltl, found neither"),
     ((*TO, *ONE, "--spec", "achieve a", "--ltl", "F a"), "expected either --spec or --ltl, found both"),
     ((*TO, *ONE, "--spec", "achieve a", "--forever"), "--forever goes with --ltl"),
-    ((*TO, *ONE, *ONE, "--spec", "achieve a"), "one --run, or two different ones, found run and run"),
+    ((*TO, *ONE, *ONE, "--spec", "achieve a"), "or two different ones, found run and run"),
     (
         (*TO, *ONE, "--run", "walk", "--run", "x", "--spec", "achieve a"),
-        "one --run, or two different ones, found run and",
+        "or two different ones, found run and",
     ),
     ((*TO, *ONE, "--run", "walk", "--spec", "achieve a"), "run is of letter, walk of walk; side by side"),
     ((*TO, "--run", "nowhere", "--spec", "achieve a"), "nowhere is not a run folder"),

@@ -39,7 +39,7 @@ from hrlspec.run.errors import UserError
 from hrlspec.run.extras import PICTURES, check_picture, drawing
 from hrlspec.run.flags import parse_flags
 from hrlspec.run.tables import ltl_table, suite_table
-from hrlspec.run.trained import Source, find_trained
+from hrlspec.run.trained import Source, check_shield, find_trained
 from hrlspec.spec import SpecError, bare_lines
 from hrlspec.spec.dfa import from_json
 from hrlspec.spec.hoa import from_hoa, until_accepting
@@ -126,8 +126,8 @@ def main(argv: Sequence[str], *, program: str = "hrlspec evaluate") -> None:
     platform.prepare()
     automaton = None if flags.automaton is None else _automaton_of(flags.automaton, tasks, source.preset)
     trained, facts = source.load()
-    if flags.shield and "reach_critic" not in trained.params:
-        raise UserError("--shield needs the reach critic of an agent that was trained with a shield; this one was not")
+    if flags.shield:
+        check_shield(trained)
     key = jax.random.fold_in(jax.random.key(flags.seed), 1)
     how: dict[str, Any] = {name: getattr(flags, name) for name in ("episodes", "seed", "greedy", "shield")}
     if isinstance(tasks, LtlSuite):

@@ -1,4 +1,4 @@
-"""Writes a page that plays episodes of trained agents: ``hrlspec replay --run DIR``, with ``--help`` for the flags.
+"""Writes a page that plays episodes of trained agents: ``hrlspec replay``, with ``--help`` for the flags.
 
 Exit status: 0 done, 2 bad usage or input.
 """
@@ -18,14 +18,13 @@ from envs_jax.base import Layout
 from hrlspec.config import Checked, setting
 from hrlspec.evaluation import ltl_suite, record_episodes, suite_from_text
 from hrlspec.run import platform
-from hrlspec.run.commands.evaluate import load_params
 from hrlspec.run.console import result_console
 from hrlspec.run.errors import UserError
-from hrlspec.run.experiment import Experiment, experiment_of
 from hrlspec.run.flags import parse_flags
-from hrlspec.run.folder import check_writable, read_record
+from hrlspec.run.folder import check_writable
 from hrlspec.run.replay.data import Played, page_data
 from hrlspec.run.replay.page import page
+from hrlspec.run.trained import Source, check_shield, find_trained
 from hrlspec.spec import TaskTree, bare_lines
 from hrlspec.spec.automata import Automata
 
@@ -39,10 +38,12 @@ class ReplayFlags(Checked):
     The page is one file, which needs neither a network nor a server.
     """
 
-    run: UseAppendAction[tuple[Path, ...]]
-    """A run folder; a second --run is shown beside the first, in the same layouts."""
     out: Path
     """The page (.html)."""
+    run: UseAppendAction[tuple[Path, ...]] = ()
+    """A run folder; a second agent is shown beside the first, in the same layouts."""
+    pretrained: UseAppendAction[tuple[str, ...]] = ()
+    """An agent that comes along, by its name, such as letter; or the .safetensors file of one."""
     spec: str | None = None
     """A task in SPECTRL, such as "achieve a; (achieve b ensuring not c)"."""
     ltl: str | None = None
@@ -64,8 +65,7 @@ class _Shown:
     """An agent that is to be shown, not loaded yet."""
 
     name: str
-    experiment: Experiment
-    folder: Path
+    source: Source
 
 
 def main(argv: Sequence[str], *, program: str = "hrlspec replay") -> None:
@@ -79,6 +79,7 @@ def main(argv: Sequence[str], *, program: str = "hrlspec replay") -> None:
         UserError: bad usage or input.
         SpecError: the task cannot be read.
         CheckpointError: there is no usable checkpoint.
+        AgentFileError: there is no such agent in a file, or it cannot be used.
     """
     flags = parse_flags(ReplayFlags, argv, program=program)
     _check(flags)
@@ -105,10 +106,9 @@ def _agents(flags: ReplayFlags) -> list[_Shown]:
     names = [run.resolve().name for run in flags.run]
     if len({*names}) < len(names):
         names = [str(run) for run in flags.run]
-    return [
-        _Shown(name, experiment_of(read_record(run)["config"], str(run)), run)
-        for name, run in zip(names, flags.run, strict=True)
-    ]
+    sources = [find_trained(run, None, None) for run in flags.run]
+    sources += [find_trained(None, name, None) for name in flags.pretrained]
+    return [_Shown(name, source) for name, source in zip((*names, *flags.pretrained), sources, strict=True)]
 
 
 def _common_world(agents: Sequence[_Shown]) -> Environment:
@@ -118,10 +118,10 @@ def _common_world(agents: Sequence[_Shown]) -> Environment:
         UserError: it is not the same.
     """
     first, *others = agents
-    env = first.experiment.preset.make()
+    env = first.source.preset.make()
     for other in others:
-        if other.experiment.preset.make() != env:
-            found = f"{first.name} is of {first.experiment.env}, {other.name} of {other.experiment.env}"
+        if other.source.preset.make() != env:
+            found = f"{first.name} is of {first.source.preset.name}, {other.name} of {other.source.preset.name}"
             raise UserError(f"{found}; side by side they are shown in the same layouts, which takes the same world")
     return env
 
@@ -141,20 +141,21 @@ def _task(flags: ReplayFlags, env: Environment) -> tuple[str, TaskTree | Automat
 
 def _play(shown: _Shown, flags: ReplayFlags, tasks: TaskTree | Automata, layouts: Layout) -> Played:
     """Lets an agent carry out the task in each layout; the random numbers are the same for all agents."""
-    agent = shown.experiment.agent
-    params, _ = load_params(agent, shown.folder)
+    trained, _ = shown.source.load()
+    if flags.shield:
+        check_shield(trained)
     episodes, record = record_episodes(
         jax.random.fold_in(jax.random.key(flags.seed), 1),
-        agent,
-        params,
-        shown.experiment.rewards,
+        trained.agent,
+        trained.params,
+        trained.rewards,
         tasks,
         layouts,
         which=np.zeros(flags.episodes, int),
         greedy=flags.greedy,
         shield=flags.shield,
     )
-    return Played(shown.name, shown.experiment.method, *jax.device_get((episodes, record)))
+    return Played(shown.name, trained.agent.method.name, *jax.device_get((episodes, record)))
 
 
 def _check(flags: ReplayFlags) -> None:
@@ -162,9 +163,10 @@ def _check(flags: ReplayFlags) -> None:
         raise UserError(f"expected either --spec or --ltl, found {'neither' if flags.spec is None else 'both'}")
     if flags.forever and flags.ltl is None:
         raise UserError("--forever goes with --ltl")
-    if not 1 <= len(flags.run) <= MOST_AGENTS or len({*flags.run}) < len(flags.run):
-        found = " and ".join(map(str, flags.run)) or "none"
-        raise UserError(f"expected one --run, or two different ones, found {found}")
+    agents = [*map(str, flags.run), *flags.pretrained]
+    if not 1 <= len(agents) <= MOST_AGENTS or len({*agents}) < len(agents):
+        found = " and ".join(agents) or "none"
+        raise UserError(f"expected one --run or --pretrained, or two different ones, found {found}")
     if flags.out.suffix != ".html":
         raise UserError(f"--out {flags.out}: expected a file that ends in .html")
     if flags.out.is_dir():
