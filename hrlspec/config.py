@@ -198,8 +198,6 @@ class RelabelConfig(Checked):
     """Share of the environments whose trajectories are trained on a second time, relabelled. 0 switches it off."""
     hindsight: bool = False
     """Whether every proposition visited counts as a completed sub-task, and not only those assigned."""
-    ensuring: bool = False
-    """Whether completed sub-tasks without an ``ensuring`` part get a random one, of what was not touched meanwhile."""
     branch: float = setting(0.7, least=0, most=1)
     """Probability of a random branch at each node of the completed path."""
 

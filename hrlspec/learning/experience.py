@@ -204,7 +204,6 @@ def _relabelled(
             max_nodes=config.curriculum.max_nodes,
             max_avoid=config.curriculum.max_avoid,
             branch=config.relabel.branch,
-            ensuring=config.relabel.ensuring,
         )
 
     return jax.vmap(one)(keys, record)

@@ -106,7 +106,6 @@ def relabel(
     max_nodes: int,
     max_avoid: int,
     branch: float | Float32[Array, ""],
-    ensuring: bool = False,
 ) -> Relabelled:
     """Relabels one environment's rollout; ``vmap`` for more.
 
@@ -123,12 +122,11 @@ def relabel(
         max_nodes: N of the new trees; branches are shortened to fit.
         max_avoid: largest random ``ensuring`` part of a branch's edge.
         branch: probability of a branch at each node of the path.
-        ensuring: whether sub-tasks of the path without an ``ensuring`` part get a random one, of what was not touched.
     """
     done_before = _completed_before(record)
     path = _path(record, done_before, num_slots, max_path)
     tree = jax.vmap(
-        lambda k, *p: _grow(k, *p, max_nodes=max_nodes, max_avoid=max_avoid, branch=branch, ensuring=ensuring),
+        lambda k, *p: _grow(k, *p, max_nodes=max_nodes, max_avoid=max_avoid, branch=branch),
     )(jax.random.split(key, num_slots), *path)
     length = path[0]
     held_out = jnp.isin(jax.vmap(task_hash)(tree), reserved) if reserved.shape[0] else jnp.zeros(num_slots, bool)
@@ -207,7 +205,6 @@ def _grow(
     max_nodes: int,
     max_avoid: int,
     branch: float | Float32[Array, ""],
-    ensuring: bool,
 ) -> TaskTree:
     """One tree around a completed path.
 
@@ -218,20 +215,13 @@ def _grow(
     longest = branch_lengths(max_path, max_nodes)
     rounds = max(1, *longest)  # One at least, so that there is something to gather nothing from where no branch fits.
     num_places = int(longest.sum())
-    width = num_propositions + 1
-    path_places = max_path if ensuring else 0
-    shapes = ((2, max_path), (rounds, max_path, num_propositions), (num_places, width), (path_places, width))
+    shapes = ((2, max_path), (rounds, max_path, num_propositions), (num_places, num_propositions + 1))
     sizes = [math.prod(shape) for shape in shapes]
     # One draw for everything: each takes longer to compile than what is done with it.
     drawn = jnp.split(jax.random.uniform(key, (sum(sizes),), jnp.float32), np.cumsum(sizes)[:-1])
-    chance, lottery, noise, path_noise = (x.reshape(shape) for x, shape in zip(drawn, shapes, strict=True))
+    chance, lottery, noise = (x.reshape(shape) for x, shape in zip(drawn, shapes, strict=True))
 
     place = np.arange(max_path)
-    if ensuring:
-        touched = seen | path_reach | _before(path_reach)
-        untouched = jax.vmap(lambda n, f: _random_avoid(n, f, max_avoid))(path_noise, touched)
-        bare = ~path_avoid.any(-1) & (place < length)
-        path_avoid = jnp.where(bare[:, None], untouched, path_avoid)
     grows = (chance[0] < branch) & (place < length)
     limit = jnp.minimum(length - place, longest).astype(jnp.int32)
     wanted = jnp.floor(chance[1] * limit).astype(jnp.int32) + 1
@@ -276,7 +266,8 @@ def _branches(
     The first goal is none of the labels seen, of what was reached before and of what the path reaches; no goal is the
     one before it.
     """
-    num_propositions, before = path_reach.shape[1], _before(path_reach)
+    num_propositions = path_reach.shape[1]
+    before = jnp.concatenate([jnp.zeros((1, num_propositions), bool), path_reach[:-1]])
     excluded, exists = seen | before | path_reach, jnp.ones(path_reach.shape[0], bool)
     reach, alive, forbidden = [], [], []
     for j in range(lottery.shape[0]):
@@ -288,11 +279,6 @@ def _branches(
         forbidden.append(goal | before)
         excluded = before = goal
     return jnp.stack(reach), jnp.stack(alive), jnp.stack(forbidden)
-
-
-def _before(path_reach: Bool[Array, "K P"]) -> Bool[Array, "K P"]:
-    """What the sub-task before each of a path reached; nothing before the first."""
-    return jnp.concatenate([jnp.zeros_like(path_reach[:1]), path_reach[:-1]])
 
 
 def _random_avoid(noise: Float32[Array, " P_and_1"], forbidden: Bool[Array, " P"], max_avoid: int) -> Bool[Array, " P"]:

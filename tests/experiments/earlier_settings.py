@@ -42,6 +42,7 @@ NEW = {
     "config.shield.optimiser.final_learning_rate": 1e-3,
     "config.shield.optimiser.epochs": 1,
     "config.shield.optimiser.max_grad_norm": 1.0,
+    "config.curriculum.joint": 0.0,
 }
 """Settings with the value that the code had before."""
 OF_METHODS = {

@@ -32,7 +32,6 @@ class Setting(NamedTuple):
     max_nodes: int
     conjunctions: bool
     visited: bool = False
-    ensuring: bool = False
 
 
 SETTINGS = [
@@ -40,7 +39,6 @@ SETTINGS = [
     Setting(max_path=3, max_nodes=9, conjunctions=True),  # room for some of each branch only
     Setting(max_path=4, max_nodes=16, conjunctions=False, visited=True),
     Setting(max_path=3, max_nodes=9, conjunctions=True, visited=True),
-    Setting(max_path=4, max_nodes=16, conjunctions=False, visited=True, ensuring=True),
 ]
 NOTHING_RESERVED = np.zeros(200, np.uint32)
 
@@ -89,7 +87,6 @@ def relabeller(setting: Setting) -> Any:
             max_nodes=setting.max_nodes,
             max_avoid=3,
             branch=branch,
-            ensuring=setting.ensuring,
         )
 
     return quick_jit(jax.vmap(one, in_axes=(0, 0, None, None)))
@@ -117,7 +114,7 @@ def slots_of(record: Record) -> list[tuple[int, int, np.ndarray]]:
     return [entry for entry in found if len(entry[2])]
 
 
-@pytest.fixture(params=SETTINGS, ids=["16 nodes", "conjunctions", "visits", "visits, conjunctions", "ensuring"])
+@pytest.fixture(params=SETTINGS, ids=["16 nodes", "conjunctions", "visits", "visits, conjunctions"])
 def setting(request: pytest.FixtureRequest) -> Setting:
     return request.param
 
@@ -160,8 +157,7 @@ def test_the_monitor_visits_the_recorded_path_at_the_recorded_times(setting: Set
                 assert node == before + 1  # the path is rows 1, 2, ...
                 place += 1
                 np.testing.assert_array_equal(tree.reach[node], record.reach[i, t])
-                if record.avoid[i, t].any() or not setting.ensuring:
-                    np.testing.assert_array_equal(tree.avoid[node], record.avoid[i, t])
+                np.testing.assert_array_equal(tree.avoid[node], record.avoid[i, t])
             assert new.terminated[i, t] == (status == "satisfied") == (place == length)
             checked += 1
     assert checked > 500
@@ -252,27 +248,6 @@ def test_trees_are_well_formed_and_follow_the_samplers_rules(setting: Setting) -
         assert max(tree.depth[nodes]) == length  # a branch is no longer than what remains of the path beside it
     assert branches > 100
     assert sizes == {0, 1, 2, 3} if not setting.conjunctions else sizes >= {0, 1, 2}
-
-
-def test_what_was_not_touched_is_avoided_in_hindsight() -> None:
-    """An own ``ensuring`` part stays; else it is random, and clear of labels on the way, of the goal and the last."""
-    (setting,) = [some for some in SETTINGS if some.ensuring]
-    record, new = relabelled(setting)
-    sizes, kept = set(), 0
-    for i, slot, steps in slots_of(record):
-        ends = steps[record.edge_taken[i, steps]][: setting.max_path]
-        if slot >= SLOTS or not len(ends):
-            continue
-        tree, begin, before = tree_at(new, i, slot), steps[0], set()
-        for k, end in enumerate(ends, 1):
-            own, goal, avoid = pairs(record.avoid[i, end]), pairs(tree.reach[k]), pairs(tree.avoid[k])
-            touched = set().union(*(pairs(labels) for labels in record.labels[i, begin : end + 1]))
-            assert not avoid & (touched | goal | before) if not own else avoid == own
-            sizes.add(len(avoid))
-            kept += bool(own)
-            begin, before = end + 1, goal
-    assert sizes == {0, 1, 2, 3}
-    assert kept
 
 
 def test_reserved_tasks_are_never_produced() -> None:

@@ -92,7 +92,7 @@ BAD_FLAGS: list[tuple[Sequence[str], str]] = [
     ),
     (
         ("--run", "run", "--ltl", MANY, "--automaton", "x.png"),
-        "--automaton x.png: the automaton has 82 states, a picture",
+        "states, a picture shows 40 at most",
     ),
     (("--run", "run", "--ltl-file", "empty"), "found no formula"),
     (("--run", "run", "--ltl-file", "wrong"), "wrong, line 2, column 9: "),
