@@ -85,8 +85,8 @@ def evaluate(missing: Sequence[Evaluation], *, work: Path, folder: Path, jobs: i
 
 def _scores(evaluation: Evaluation, work: Path, place: Place) -> dict[str, Any]:
     """What ``experiments.evaluate`` says of an agent."""
-    number = EPISODES if "/" in evaluation.suite else 2 * EPISODES  # of each formula; of the two chains together
-    flags = ["--run", str(work / evaluation.run.name), "--suite", evaluation.suite, "--episodes", str(number), "--json"]
+    how = ["--protocol", "jaxolotl"] if "/" in evaluation.suite else ["--episodes", str(2 * EPISODES)]  # two chains
+    flags = ["--run", str(work / evaluation.run.name), "--suite", evaluation.suite, *how, "--json"]
     command = [sys.executable, "-m", "experiments.evaluate", *flags]
     with place.start(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         said, complaint = process.communicate()

@@ -32,6 +32,7 @@ from hrlspec.evaluation.ltl import check_propositions, suite_of_automata
 from hrlspec.evaluation.suite import MAX_NODES
 from hrlspec.presets import Preset
 from hrlspec.presets.peers import go_on_for_ever, peer_formulas
+from hrlspec.presets.peers.protocols import Protocol, manner
 from hrlspec.run import platform
 from hrlspec.run.automaton_file import check_automaton, check_automaton_file, write_automaton
 from hrlspec.run.console import result_console
@@ -85,6 +86,9 @@ class EvaluateFlags(Checked):
     """A suite of the agent's environment, such as dag, or published formulas, such as jaxolotl/letter_finite."""
     episodes: int = setting(500, least=1, most=1_000_000)
     """In all; at least one for each task. For tasks as automata, of each."""
+    protocol: Protocol | None = None
+    """Evaluate formulas as others do: jaxolotl, 512 episodes of each, actions sampled; deepltl, 500, in Zone greedy
+    where they are finite. Takes the place of --episodes and --greedy."""
     seed: int = setting(0, least=0, most=2**31 - 1)
     """Of layouts and actions."""
     step: int | None = None
@@ -121,6 +125,8 @@ def main(argv: Sequence[str], *, program: str = "hrlspec evaluate") -> None:
     source = find_trained(flags.run, flags.pretrained, flags.step)
     _check(flags)
     tasks = formulas_of(flags, source.preset) or tasks_of(flags, source)
+    if flags.protocol is not None and not isinstance(tasks, LtlSuite):
+        raise UserError(f"--protocol {flags.protocol} is for formulas and automata, not for tasks in SPECTRL")
     if flags.draw is not None and isinstance(tasks, LtlSuite):
         raise UserError("--draw takes tasks in SPECTRL, no formulas and no automata; --automaton draws one of these")
     platform.prepare()
@@ -131,6 +137,9 @@ def main(argv: Sequence[str], *, program: str = "hrlspec evaluate") -> None:
     key = jax.random.fold_in(jax.random.key(flags.seed), 1)
     how: dict[str, Any] = {name: getattr(flags, name) for name in ("episodes", "seed", "greedy", "shield")}
     if isinstance(tasks, LtlSuite):
+        if flags.protocol is not None:
+            how |= manner(flags.protocol, trained.agent.env, tasks.forever)._asdict()
+            facts |= {"protocol": flags.protocol}
         _show(flags, evaluate_ltl(key, trained.agent, trained.params, trained.rewards, tasks, **how), facts)
     else:
         try:
@@ -276,6 +285,8 @@ def _check(flags: EvaluateFlags) -> None:
         raise UserError("--forever goes with --ltl, --ltl-file or --hoa")
     if flags.semantics != "committed" and flags.spec is None and flags.spec_file is None:
         raise UserError(f"--semantics {flags.semantics} goes with --spec or --spec-file")
+    if flags.protocol is not None and (flags.greedy or flags.episodes != EvaluateFlags.episodes):
+        raise UserError(f"--protocol {flags.protocol} says how many episodes there are and whether actions are sampled")
     if flags.automaton is not None:
         check_automaton_file("--automaton", flags.automaton)
     if flags.draw is not None:
