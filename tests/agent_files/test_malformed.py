@@ -172,7 +172,7 @@ MALFORMED: dict[str, tuple[Change, str]] = {
     "cut off": (lambda draft: draft.file.write_bytes(draft.content[:-100]), "does not match the SHA-256"),
     "another hash": (card_text(lambda draft: json.dumps(draft.card | {"sha256": "0" * 64})), "does not match the SHA"),
     # As safetensors, with their hash in the card.
-    "empty": (content(lambda _: b""), "header too small"),
+    "empty": (content(lambda _: b""), "it holds no parameters"),
     "cut off and signed": (content(lambda draft: draft.content[:-100]), "it holds no parameters"),
     "more than it says": (content(lambda draft: draft.content + b"more"), "it holds no parameters"),
     "a pickle": (content(lambda _: pickle.dumps(Command())), "it holds no parameters"),

@@ -46,7 +46,7 @@ SAMPLED = [name if name == "letter" else pytest.param(name, marks=pytest.mark.sl
 @pytest.mark.parametrize("name", SAMPLED)
 def test_an_agent_is_as_good_as_its_card_says(name: str) -> None:
     bound = read_agent(name).card.success_at_least["dag"]
-    assert bound > 0.9
+    assert bound > 0.8
     assert enough(successes(hrlspec.pretrained(name), name), bound)
 
 

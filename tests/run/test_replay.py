@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 
@@ -24,6 +23,7 @@ from hrlspec.run.replay.data import Played, page_data
 from hrlspec.run.replay.page import SCRIPTS, page
 from hrlspec.run.run_flags import experiments_of, parse_run
 from hrlspec.spec import TaskState
+from tests.agent_files.made import write_tiny
 from tests.bare import Bare
 from tests.run import tiny
 from tests.run.replays import EPISODES, LETTER, played, tasks_of
@@ -173,13 +173,13 @@ BAD_FLAGS: list[tuple[Sequence[str], str]] = [
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A working directory with runs that were begun, of two worlds, and one with fresh parameters."""
+    """A working directory with runs that were begun, of two worlds, and one with parameters, also in a file."""
     folder = tmp_path_factory.mktemp("place")
     for name, flags in (("run", []), ("walk", ["--env", "walk"]), ("fresh", tiny.arguments(folder / "fresh"))):
         ((experiment, path),) = experiments_of(parse_run(["--out", str(folder / name), *flags]))
         with open_run(path, experiment, tensorboard=False):
             pass
-    checkpoint.save(folder / "fresh" / "checkpoints", 3, {"params": jax.jit(experiment.agent.init)(jax.random.key(0))})
+    checkpoint.save(folder / "fresh" / "checkpoints", 3, {"params": write_tiny(folder / "it.safetensors", experiment)})
     (folder / "folder.html").mkdir()
     (folder / "file").write_text("x")
     return folder
@@ -206,7 +206,8 @@ def test_bad_input(
 
 def test_the_command(place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(place)
-    flags = "--run fresh --spec|achieve a; (achieve b or achieve c)|--episodes 2 --out pages/one.html"
+    agents = "--run fresh --pretrained it.safetensors"
+    flags = f"{agents} --spec|achieve a; (achieve b or achieve c)|--episodes 2 --out pages/one.html"
     spec = flags.split("|")
     replay.main([*spec[0].split(), spec[1], *spec[2].split()])
     assert "pages/one.html: 2 episodes in " in capsys.readouterr().out
@@ -214,4 +215,8 @@ def test_the_command(place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     (record,) = re.findall(r'<script type="application/json" id="record">(.*?)</script>', text)
     data = json.loads(record)
     assert (data["formula"], data["world"]) == (spec[1], "letter")
-    assert [(run["name"], run["method"], len(run["episodes"])) for run in data["runs"]] == [("fresh", "ours", 2)]
+    assert [(run["name"], run["method"], len(run["episodes"])) for run in data["runs"]] == [
+        ("fresh", "ours", 2),
+        ("it.safetensors", "ours", 2),
+    ]
+    assert data["runs"][0]["episodes"] == data["runs"][1]["episodes"]  # it is the same agent
