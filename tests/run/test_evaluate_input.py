@@ -95,7 +95,7 @@ BAD_FLAGS: list[tuple[Sequence[str], str]] = [
     ),
     (
         ("--run", "run", "--ltl", MANY, "--automaton", "x.png"),
-        "states, a picture shows 40 at most",
+        "the automaton has 81 states, a picture shows 40",
     ),
     (("--run", "run", "--ltl-file", "empty"), "found no formula"),
     (("--run", "run", "--ltl-file", "wrong"), "wrong, line 2, column 9: "),
