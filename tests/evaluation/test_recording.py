@@ -118,7 +118,8 @@ def test_an_episode_that_is_recorded_goes_as_it_does_otherwise() -> None:
     np.testing.assert_array_equal(record.before.position, trace.env_state.position)
 
 
-@pytest.mark.parametrize("name", [pytest.param("option", marks=pytest.mark.slow), "ltl2action"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["option", "ltl2action"])
 def test_other_methods_are_recorded(name: str) -> None:
     env = envs_jax.make("letter", horizon=12)
     _, _, record = recorded(env, METHODS[name], TASK)

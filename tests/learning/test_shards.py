@@ -86,6 +86,7 @@ def assert_agree(one: TrainState, other: TrainState) -> None:
             assert state_hash(x) == state_hash(y)
 
 
+@SLOW
 def test_an_iteration_does_not_depend_on_the_number_of_devices() -> None:
     """Each of 30 in a row, started from the same state; to the bit it is only where XLA adds up alike, see below."""
     state = fresh(1)
