@@ -60,15 +60,24 @@ def find_trained(run: Path | None, pretrained: str | None, step: int | None) -> 
         UserError: not exactly one of them is given, or a run folder's record or a file cannot be read here.
         AgentFileError: there is no such agent, or its card is not of this version.
     """
-    if (run is None) == (pretrained is None):
-        found = "none" if run is None else "both"
-        raise UserError(f"expected exactly one of --run and --pretrained, found {found}")
+    check_named(run, pretrained, step)
     if pretrained is not None:
-        if step is not None:
-            raise UserError("--step goes with --run: a file holds the agent of one step")
         return _in_file(pretrained)
     assert run is not None
     return _in_run(run, step)
+
+
+def check_named(run: Path | None, pretrained: str | None, step: int | None) -> None:
+    """Whether the flags name one agent; nothing is read.
+
+    Raises:
+        UserError: not exactly one of --run and --pretrained is given, or --step with the latter.
+    """
+    if (run is None) == (pretrained is None):
+        found = "none" if run is None else "both"
+        raise UserError(f"expected exactly one of --run and --pretrained, found {found}")
+    if pretrained is not None and step is not None:
+        raise UserError("--step goes with --run: a file holds the agent of one step")
 
 
 def check_shield(trained: TrainedAgent) -> None:

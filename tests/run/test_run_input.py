@@ -269,7 +269,7 @@ def test_records_of_other_versions_are_refused() -> None:
         ({**record, "extra": 1}, "the setting 'extra'"),
         ({name: record[name] for name in record if name != "seed"}, "the setting 'seed'"),
         ({**record, "config": {**record["config"], "zeta": 1}}, "the setting 'config.zeta'"),
-        ({**record, "config": 3}, "the setting 'config."),
+        ({**record, "config": 3}, "config is 3"),
         ({**record, "method_settings": {**settings, "zeta": 1}}, "the setting 'method_settings.zeta'"),
         ({**record, "method_settings": {"high": {}}}, "the setting 'method_settings.high."),
         ({**record, "seed": "0"}, "seed is '0'"),

@@ -40,7 +40,7 @@ from hrlspec.run.errors import UserError
 from hrlspec.run.extras import PICTURES, check_picture, drawing
 from hrlspec.run.flags import parse_flags
 from hrlspec.run.tables import ltl_table, suite_table
-from hrlspec.run.trained import Source, check_shield, find_trained
+from hrlspec.run.trained import Source, check_named, check_shield, find_trained
 from hrlspec.spec import SpecError, bare_lines
 from hrlspec.spec.dfa import from_json
 from hrlspec.spec.hoa import from_hoa, until_accepting
@@ -122,8 +122,9 @@ def main(argv: Sequence[str], *, program: str = "hrlspec evaluate") -> None:
         AgentFileError: there is no such agent in a file, or it cannot be used.
     """
     flags = parse_flags(EvaluateFlags, argv, program=program)
-    source = find_trained(flags.run, flags.pretrained, flags.step)
+    check_named(flags.run, flags.pretrained, flags.step)
     _check(flags)
+    source = find_trained(flags.run, flags.pretrained, flags.step)
     tasks = formulas_of(flags, source.preset) or tasks_of(flags, source)
     if flags.protocol is not None and not isinstance(tasks, LtlSuite):
         raise UserError(f"--protocol {flags.protocol} is for formulas and automata, not for tasks in SPECTRL")
