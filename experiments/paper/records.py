@@ -22,8 +22,9 @@ from pathlib import Path
 from typing import Any
 
 from experiments.paper.panels import Run
+from hrlspec.run.configuration import config_hash
 from hrlspec.run.errors import UserError
-from hrlspec.run.folder import config_hash, read_metrics, read_record, read_summary
+from hrlspec.run.folder import read_metrics, read_record, read_summary
 
 CURVE = ("env_steps", "wall_s", "level", "eval/return_mean", "eval/success_rate", "eval/steps_mean", "train/violations")
 """Metrics kept of each evaluation during training."""

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 from experiments.paper.making import Place, places
 from experiments.paper.panels import Run
 from experiments.published.comparisons import EPISODES
+from hrlspec.run.circumstances import current_commit
 from hrlspec.run.errors import UserError
-from hrlspec.run.folder import current_commit
 
 FILE = "evaluations.jsonl"
 

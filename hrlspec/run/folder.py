@@ -19,34 +19,25 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import datetime
-import hashlib
-import importlib.metadata
 import json
-import math
 import os
-import platform
 import shutil
-import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Protocol, Self
 
-import jax
-import numpy as np
-
+from hrlspec.run.circumstances import circumstances
+from hrlspec.run.configuration import config_hash, differences, dotted, plain
 from hrlspec.run.errors import UserError
 from hrlspec.run.files import write_atomically
-from hrlspec.version import __version__
 
 FORMAT = 1
 _LOCK = ".lock"
 _LOCK_TRIES, _LOCK_PAUSE = 20, 0.01  # seconds
 _LEFT_BY_A_KILL = {_LOCK, ".config.new.json"}  # all that a process killed at once after its start leaves
 _BEGUN = (*_LEFT_BY_A_KILL, "config.json", "tensorboard", "wandb", "wandb.json")  # what `open_run` makes
-_PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "orbax-checkpoint")
 
 
 class Recorder(Protocol):
@@ -121,19 +112,19 @@ class RunFolder:
             row: ``env_steps`` and any JSON-like values; numpy and JAX scalars and arrays become numbers and lists, and
                 numbers that are not finite become ``null``, which every JSON reader understands.
         """
-        plain = _plain(row)
-        if not isinstance(plain.get("env_steps"), int):
-            raise ValueError(f"a row of metrics needs an integer env_steps, found {plain.get('env_steps')!r}")
+        entries = plain(row)
+        if not isinstance(entries.get("env_steps"), int):
+            raise ValueError(f"a row of metrics needs an integer env_steps, found {entries.get('env_steps')!r}")
         if self._last_step is None:
             raise RuntimeError("a resumed run calls rewind before it adds rows")
-        if plain["env_steps"] < self._last_step:
-            raise ValueError(f"row of env_steps {plain['env_steps']} after one of {self._last_step}")
-        self._last_step = plain["env_steps"]
+        if entries["env_steps"] < self._last_step:
+            raise ValueError(f"row of env_steps {entries['env_steps']} after one of {self._last_step}")
+        self._last_step = entries["env_steps"]
         with (self.path / "metrics.jsonl").open("a") as file:
-            file.write(json.dumps(plain, allow_nan=False) + "\n")
+            file.write(json.dumps(entries, allow_nan=False) + "\n")
             file.flush()
             os.fsync(file.fileno())
-        self.tell(plain.pop("env_steps"), plain)
+        self.tell(entries.pop("env_steps"), entries)
 
     def tell(self, env_steps: int, values: Mapping[str, Any]) -> None:
         """Tells TensorBoard, and Weights & Biases if asked to, what is a number; nested ones under names with slashes.
@@ -144,7 +135,7 @@ class RunFolder:
         """
         numbers = {
             name.replace(".", "/"): value
-            for name, value in dotted(_plain(values)).items()
+            for name, value in dotted(plain(values)).items()
             if isinstance(value, int | float) and not isinstance(value, bool)
         }
         for recorder in self._recorders:
@@ -152,7 +143,7 @@ class RunFolder:
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """Writes ``summary.json``, replacing an earlier one as a whole; it has an entry ``env_steps``."""
-        write_atomically(self.path / "summary.json", json.dumps(_plain(summary), indent=2, allow_nan=False) + "\n")
+        write_atomically(self.path / "summary.json", json.dumps(plain(summary), indent=2, allow_nan=False) + "\n")
 
     def write_tasks(self, name: str, text: str) -> None:
         """Writes a test suite."""
@@ -287,7 +278,7 @@ def _open(
     wandb: str | None,
 ) -> RunFolder:
     """`open_run` up to the point where the caller takes over; what must be undone goes on the stack."""
-    resolved = _plain(config)
+    resolved = plain(config)
     check_place(folder, resume=resume)
     with contextlib.ExitStack() as undo:
         undo.callback(_remove_empty, [place for place in (folder, *folder.parents) if not place.exists()])
@@ -380,11 +371,6 @@ def read_summary(path: str | os.PathLike[str]) -> dict[str, Any] | None:
     return summary
 
 
-def config_hash(config: Mapping[str, Any]) -> str:
-    """SHA-256 of a configuration, the same for every order of its entries."""
-    return hashlib.sha256(json.dumps(_plain(config), sort_keys=True).encode()).hexdigest()
-
-
 def check_same(folder: Path, there: Any, here: Any, may_change: Sequence[str]) -> None:
     """Refuses to continue a run under another configuration.
 
@@ -405,27 +391,6 @@ def check_same(folder: Path, there: Any, here: Any, may_change: Sequence[str]) -
             f"{folder} was begun with {first} = {old!r}, not {new!r}"
             f"{more}: resume with the flags it was begun with, or choose another --out"
         )
-
-
-def differences(there: Any, here: Any) -> dict[str, tuple[Any, Any]]:
-    """Settings in which two configurations differ, by dotted names in their order: the value there, the value here."""
-    old, new = dotted(_plain(there)), dotted(_plain(here))
-    return {
-        name: (old.get(name, "nothing"), new.get(name, "nothing"))
-        for name in sorted(old.keys() | new.keys())
-        if old.get(name) != new.get(name)
-    }
-
-
-def dotted(config: Any, prefix: str = "") -> dict[str, Any]:
-    """Nested entries under dotted names, such as ``config.low.clip``; lists are values."""
-    if not isinstance(config, dict) or not config:
-        return {prefix: config}
-    return {
-        name: value
-        for key, inner in config.items()
-        for name, value in dotted(inner, f"{prefix}.{key}" if prefix else key).items()
-    }
 
 
 def is_being_written(folder: Path) -> bool:
@@ -475,50 +440,3 @@ def _read_rows(folder: Path) -> tuple[list[dict[str, Any]], int]:
             raise UserError(f"{file}, line {number}: not a row of metrics") from error
         rows.append(row)
     return rows, int(lines[-1] != "")
-
-
-def _plain(value: Any) -> Any:
-    """The value in terms of JSON."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return _plain(dataclasses.asdict(value))
-    if isinstance(value, Mapping):
-        return {str(key): _plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    if isinstance(value, np.ndarray | np.generic | jax.Array):
-        return _plain(np.asarray(value).tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, str | int):
-        return value
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
-    raise TypeError(f"a {type(value).__name__} has no form in JSON: {value!r}")
-
-
-def circumstances() -> dict[str, Any]:
-    """What numbers depend on beside the configuration: versions, commit, command, time, machine, devices."""
-    versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
-    return {
-        "versions": {"hrlspec": __version__, "python": platform.python_version(), **versions},
-        "commit": current_commit(),
-        "command": sys.argv,
-        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPUs",
-        "devices": [str(device) for device in jax.devices()],
-    }
-
-
-def current_commit() -> str | None:
-    """The commit this code stands at, ``+changes`` if files differ from it; ``None`` where git does not know."""
-    source = Path(__file__)
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(source.parent), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-
-    try:
-        git("ls-files", "--error-unmatch", source.name)  # an installed copy may lie in somebody else's repository
-        return git("rev-parse", "HEAD") + ("+changes" if git("status", "--porcelain", "--untracked-files=no") else "")
-    except (OSError, subprocess.SubprocessError):
-        return None

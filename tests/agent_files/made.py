@@ -13,8 +13,8 @@ import numpy as np
 import safetensors.numpy
 
 from hrlspec.agent_files import write_agent
+from hrlspec.run.circumstances import circumstances
 from hrlspec.run.experiment import Experiment
-from hrlspec.run.folder import circumstances
 from hrlspec.run.run_flags import experiments_of, parse_run
 from tests.probes import random_params
 from tests.run import tiny

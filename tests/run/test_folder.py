@@ -17,8 +17,9 @@ import pytest
 from tensorboardX.proto import event_pb2
 from tensorboardX.record_writer import RecordWriter
 
+from hrlspec.run.configuration import config_hash
 from hrlspec.run.errors import UserError
-from hrlspec.run.folder import config_hash, open_run, read_metrics, read_record, read_summary
+from hrlspec.run.folder import open_run, read_metrics, read_record, read_summary
 
 ROOT = Path(__file__).parents[2]
 

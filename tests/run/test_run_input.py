@@ -16,9 +16,10 @@ from hrlspec.config import evolve
 from hrlspec.methods import METHODS
 from hrlspec.presets import PRESETS, RewardSet, preset
 from hrlspec.run.commands import run
+from hrlspec.run.configuration import config_hash
 from hrlspec.run.errors import UserError, main_guard
 from hrlspec.run.experiment import Experiment, experiment_of
-from hrlspec.run.folder import config_hash, open_run
+from hrlspec.run.folder import open_run
 from hrlspec.run.run_flags import experiments_of, parse_run, schedules_moved
 
 ROOT = Path(__file__).parents[2]

@@ -17,11 +17,11 @@ from rich.table import Column, Table
 from hrlspec.config import Checked
 from hrlspec.evaluation.results import interval_from_json, interval_to_json
 from hrlspec.evaluation.stats import Interval, mean_interval
+from hrlspec.run.configuration import config_hash, dotted
 from hrlspec.run.console import result_console
 from hrlspec.run.errors import UserError
 from hrlspec.run.extras import PICTURES, check_picture, drawing
 from hrlspec.run.flags import parse_flags
-from hrlspec.run.folder import config_hash, dotted
 from hrlspec.run.listing import FoundRun, look_at
 from hrlspec.run.tables import cell, plain_table
 

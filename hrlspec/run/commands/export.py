@@ -19,11 +19,12 @@ from hrlspec.evaluation import SuiteEvaluation, SuiteResult, final_evaluation, m
 from hrlspec.presets import Preset
 from hrlspec.presets.suite_rules import VALIDATION
 from hrlspec.run import platform
+from hrlspec.run.circumstances import circumstances
 from hrlspec.run.console import PlainConsole, result_console
 from hrlspec.run.errors import UserError
 from hrlspec.run.experiment import experiment_of
 from hrlspec.run.flags import parse_flags
-from hrlspec.run.folder import check_writable, circumstances, read_record
+from hrlspec.run.folder import check_writable, read_record
 from hrlspec.run.learner import LAYOUTS, spread
 from hrlspec.run.tables import plain_table
 from hrlspec.run.trained import find_trained

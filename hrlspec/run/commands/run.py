@@ -18,20 +18,12 @@ from hrlspec.agent_files import AgentFile
 from hrlspec.evaluation import SuiteResult, aggregate
 from hrlspec.learning.shards import most_devices
 from hrlspec.run import platform
+from hrlspec.run.configuration import differences
 from hrlspec.run.console import PlainConsole, result_console
 from hrlspec.run.errors import UserError
 from hrlspec.run.experiment import Experiment, experiment_of
 from hrlspec.run.extras import check_wandb, drawing
-from hrlspec.run.folder import (
-    RunFolder,
-    check_place,
-    check_same,
-    differences,
-    holds_run,
-    open_run,
-    read_record,
-    read_summary,
-)
+from hrlspec.run.folder import RunFolder, check_place, check_same, holds_run, open_run, read_record, read_summary
 from hrlspec.run.learner import Learner, on_one_device
 from hrlspec.run.live_curves import CURVES, LiveCurves, draw_curves
 from hrlspec.run.loop import DivergedError, Loop, UnsavedError
