@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -32,21 +33,41 @@ def test_the_dilemma() -> None:
 def test_what_is_drawn(world: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     """The whole command, with agents that have learned nothing."""
 
-    def untrained(demo_: Any, method: Any, steps: int, seed: int) -> Any:
+    def untrained(demo_: Any, method: Any, steps: int, seeds: Any) -> Any:
         agent = demo_.agent(method, steps)
-        return agent, agent.init(jax.random.key(seed))
+        return [(seed, (agent, agent.init(jax.random.key(seed)))) for seed in seeds]
 
     monkeypatch.setattr(demo, "train", untrained)
     monkeypatch.setattr(demo, "LAYOUTS", 4)
-    demo.main([world, "--out", str(tmp_path)])
+    demo.main([world, "--num-seeds", "2", "--out", str(tmp_path)])
     assert (tmp_path / f"demo-{world}.png").stat().st_size > 5_000
+    lines = [json.loads(line) for line in (tmp_path / f"demo-{world}.jsonl").read_text().splitlines()]
+    assert [(line["method"], line["seed"]) for line in lines] == [
+        (m, s) for m in demo.DEMOS[world].methods for s in (0, 1)
+    ]
     assert demo.DEMOS[world].task in " ".join(capsys.readouterr().out.split())
 
 
-@pytest.mark.parametrize(("flags", "message"), [("castle", "castle"), ("rooms --steps 0", "--steps is 0")])
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("castle", "castle"),
+        ("rooms --steps 0", "--steps is 0"),
+        (
+            "rooms --methods ltl2action",
+            "--methods ltl2action: it is not compared in rooms, expected some of: ours, option",
+        ),
+    ],
+)
 def test_bad_input(flags: str, message: str) -> None:
     with pytest.raises(UserError, match=message):
         demo.main(flags.split())
+
+
+def _trained(example: demo.Demo, method: str) -> tuple[Any, int]:
+    """An agent of seed 0, and the seed."""
+    [(seed, agent)] = demo.train(example, method, example.steps, [0])
+    return agent, seed
 
 
 @pytest.mark.slow
@@ -58,7 +79,7 @@ def test_thinking_ahead_fetches_the_key_first() -> None:
     rooms = demo.DEMOS["rooms"]
     steps = {}
     for method in rooms.methods:
-        shown = demo.act(rooms, demo.train(rooms, method, rooms.steps, 0), 0)
+        shown = demo.act(rooms, *_trained(rooms, method))
         success = shown.episodes.success
         assert success.mean() > (0.99 if method == "ours" else 0.3)
         steps[method] = shown.episodes.steps[success].mean()
@@ -72,5 +93,5 @@ def test_thinking_ahead_fetches_the_key_first() -> None:
 def test_what_closes_off_a_better_goal_is_left_alone() -> None:
     """All episodes of ours go past a to b and c, for 10 instead of 1."""
     dilemma = demo.DEMOS["dilemma"]
-    shown = demo.act(dilemma, demo.train(dilemma, "ours", dilemma.steps, 0), 0)
+    shown = demo.act(dilemma, *_trained(dilemma, "ours"))
     assert (shown.episodes.returns == 10).all()

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,7 +30,9 @@ from hrlspec.learning.train import Trainer
 from hrlspec.presets import Preset, RewardSet
 from hrlspec.presets.demos import DILEMMA, ROOMS
 from hrlspec.run import platform
+from hrlspec.run.circumstances import circumstances
 from hrlspec.run.console import result_console
+from hrlspec.run.errors import UserError
 from hrlspec.run.extras import check_drawing, drawing
 from hrlspec.run.flags import parse_flags
 from hrlspec.run.folder import check_writable
@@ -51,10 +54,14 @@ class DemoFlags(Checked):
     world: tyro.conf.Positional[Literal["rooms", "dilemma"]]
     """rooms: a key to think of; dilemma: a reward to do without."""
     seed: int = setting(0, least=0, most=2**31 - 1)
+    num_seeds: int = setting(1, least=1, most=1000)
+    """How many, one after another; the picture is of the first."""
+    methods: tuple[str, ...] = ()
+    """Some of those that are compared, such as ours; all if not given."""
     steps: int | None = setting(None, least=1, most=2**40)
     """Environment steps of each method; 0.6 M in rooms and 1 M in dilemma if not given."""
     out: Path = Path("runs")
-    """Folder for the picture."""
+    """Folder for the picture, and for a record of each method and seed: demo-rooms.jsonl."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,30 +116,52 @@ def main(argv: Sequence[str], *, program: str = "hrlspec demo") -> None:
     """
     flags = parse_flags(DemoFlags, argv, program=program)
     demo = DEMOS[flags.world]
+    for method in flags.methods:
+        if method not in demo.methods:
+            expected = ", ".join(demo.methods)
+            raise UserError(f"--methods {method}: it is not compared in {flags.world}, expected some of: {expected}")
+    methods = flags.methods or demo.methods
     steps = demo.steps if flags.steps is None else flags.steps
     check_writable(flags.out)
     check_drawing()
     platform.prepare()
-    shown = {method: act(demo, train(demo, method, steps, flags.seed), flags.seed) for method in demo.methods}
+    shown: dict[tuple[str, int], Shown] = {}
+    flags.out.mkdir(parents=True, exist_ok=True)
+    for method in methods:
+        for seed, trained in train(demo, method, steps, range(flags.seed, flags.seed + flags.num_seeds)):
+            shown[method, seed] = act(demo, trained, seed)
+            line = {
+                "world": flags.world,
+                "method": method,
+                "seed": seed,
+                "steps": steps,
+                **shown[method, seed].scores(),
+            }
+            with (flags.out / f"demo-{flags.world}.jsonl").open("a", encoding="utf-8") as file:
+                file.write(json.dumps({**line, **circumstances()}) + "\n")
     result_console().print(table(demo, shown))
     with drawing():
-        flags.out.mkdir(parents=True, exist_ok=True)
-        print(f"picture: {draw(demo, shown, flags.out / f'demo-{flags.world}.png')}")
+        first = {method: shown[method, flags.seed] for method in methods}
+        print(f"picture: {draw(demo, first, flags.out / f'demo-{flags.world}.png')}")
 
 
-def train(demo: Demo, method: str, steps: int, seed: int) -> tuple[Agent, Params]:
-    """An agent trained on random tasks in the world, and its parameters. The task itself may be among them."""
+def train(demo: Demo, method: str, steps: int, seeds: Iterable[int]) -> Iterator[tuple[int, tuple[Agent, Params]]]:
+    """For each seed an agent trained on random tasks in the world, and its parameters.
+
+    The task itself may be among them.
+    """
     trainer = Trainer(demo.agent(method, steps))
     config, nothing = trainer.agent.config, np.zeros(0, np.uint32)
-    banks = TaskBanks(seed, config.curriculum, demo.env.num_propositions, nothing)
-    state = trainer.init(jax.random.key(seed), banks.at(0), demo.machine)
     iterate = Program("iterate", Trainer.iterate, trainer, effort=demo.preset.effort("hrlspec"))
-    with ProgressDisplay(config.num_iterations * config.steps_per_iteration, f"{demo.env.name}, {method}") as display:
-        for i in range(config.num_iterations):
-            state, metrics = iterate(state, banks.at(i), demo.machine, nothing)
-            display.advance((i + 1) * config.steps_per_iteration, {k: float(v) for k, v in metrics.items()})
-    params: Params = state.params
-    return trainer.agent, params
+    for seed in seeds:
+        banks = TaskBanks(seed, config.curriculum, demo.env.num_propositions, nothing)
+        state = trainer.init(jax.random.key(seed), banks.at(0), demo.machine)
+        title = f"{demo.env.name}, {method}, seed {seed}"
+        with ProgressDisplay(config.num_iterations * config.steps_per_iteration, title) as display:
+            for i in range(config.num_iterations):
+                state, metrics = iterate(state, banks.at(i), demo.machine, nothing)
+                display.advance((i + 1) * config.steps_per_iteration, {k: float(v) for k, v in metrics.items()})
+        yield seed, (trainer.agent, state.params)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,6 +180,15 @@ class Shown:
     episodes: Episodes
     trace: Trace
 
+    def scores(self) -> dict[str, float | None]:
+        """Success rate, mean steps of the episodes that succeed (``None`` if none does), mean return."""
+        episodes, success = self.episodes, self.episodes.success
+        return {
+            "success_rate": float(success.mean()),
+            "steps_mean": float(episodes.steps[success].mean()) if success.any() else None,
+            "return_mean": float(episodes.returns.mean()),
+        }
+
 
 def act(demo: Demo, trained: tuple[Agent, Params], seed: int) -> Shown:
     """Lets an agent carry out the task in many layouts, greedily."""
@@ -164,33 +202,33 @@ def act(demo: Demo, trained: tuple[Agent, Params], seed: int) -> Shown:
     return Shown(tree, jax.tree.map(np.asarray, layouts), episodes, trace)
 
 
-def table(demo: Demo, shown: dict[str, Shown]) -> Table:
-    """Success, steps and return of each method; in the rooms what thinking ahead and not doing so would take."""
-    result = plain_table(demo.task, ("method", "success", "steps", "return"))
-    for method, some in shown.items():
-        episodes = some.episodes
-        steps = episodes.steps[episodes.success].mean() if episodes.success.any() else float("nan")
-        result.add_row(method, f"{episodes.success.mean():.3f}", f"{steps:.1f}", f"{episodes.returns.mean():.2f}")
-    for name, each in ways(demo, shown).items():
-        result.add_row(name, "1.000", f"{each.mean():.1f}", "1.00")
+def table(demo: Demo, shown: Mapping[tuple[str, int], Shown]) -> Table:
+    """Success, steps and return by method and seed; in the rooms what thinking ahead and not doing so would take."""
+    result = plain_table(demo.task, ("method", "seed", "success", "steps", "return"))
+    for (method, seed), some in shown.items():
+        success, steps, returns = some.scores().values()
+        result.add_row(
+            method, str(seed), f"{success:.3f}", "never" if steps is None else f"{steps:.1f}", f"{returns:.2f}"
+        )
+    for name, each in ways(demo, next(iter(shown.values())).layouts).items():
+        result.add_row(name, "", "1.000", f"{each.mean():.1f}", "1.00")
     return result
 
 
-def ways(demo: Demo, shown: Mapping[str, Shown]) -> dict[str, np.ndarray]:
+def ways(demo: Demo, layouts: Layout) -> dict[str, np.ndarray]:
     """What each of the example's ways takes in each of the layouts, int ``[B]``."""
-    layouts = next(iter(shown.values())).layouts
     each = [jax.tree.map(lambda x, i=i: x[i], layouts) for i in range(LAYOUTS)]
     return {name: np.array([way(layout) for layout in each]) for name, way in demo.ways.items()}
 
 
-def draw(demo: Demo, shown: dict[str, Shown], file: Path) -> Path:
+def draw(demo: Demo, shown: Mapping[str, Shown], file: Path) -> Path:
     """One episode of each method, in the same layout: the one where most is at stake."""
     from matplotlib.figure import Figure
 
     from hrlspec.run import plots
     from hrlspec.run.figures import save
 
-    steps_of_ways = [*ways(demo, shown).values()]
+    steps_of_ways = [*ways(demo, next(iter(shown.values())).layouts).values()]
     index = int(np.argmax(steps_of_ways[-1] - steps_of_ways[0])) if steps_of_ways else 0
     figure = Figure(figsize=(5 * len(shown), demo.height), layout="constrained")
     axes: Any = figure.subplots(1, len(shown), squeeze=False)
