@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Bool, Float, Float32, Int, Int32, Key, Shaped
-from scipy import ndimage
 
 from envs_jax.arrays import Array
 from envs_jax.base import Box, Drawable, EnvParams, GridMap, StepResult
@@ -345,6 +344,8 @@ def _regions(env: Walk) -> Float32[np.ndarray, "3 P K"]:
 
 def _all_alone(env: Walk, discs: Float[np.ndarray, "3 P K"]) -> bool:
     """Whether from every start each proposition can be had alone, with room to stand, over ground without any."""
+    from scipy import ndimage  # for random regions alone; half a second to import
+
     start = (env.low, env.low) if env.start is None else env.start
     labels, inside, place = env.grid(WalkLayout(start=np.asarray(start), discs=discs))  # type: ignore[arg-type]
     block = np.ones((3, 3), bool)

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from hrlspec.agent.agent import Agent
@@ -116,8 +115,8 @@ def read_params(file: AgentFile) -> Params:
     for name in wanted:
         if not np.isfinite(found[name]).all():
             raise AgentFileError(path, f"{name!r} holds values that are not finite")
-    params: Params = jax.tree_util.tree_unflatten(structure, [jnp.asarray(found[name]) for name in wanted])
-    return params
+    params: Params = jax.tree_util.tree_unflatten(structure, [found[name] for name in wanted])
+    return jax.device_put(params)
 
 
 def write_agent(

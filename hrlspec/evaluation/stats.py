@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.special
-import scipy.stats
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
@@ -189,7 +188,9 @@ def difference_interval(ours: ArrayLike, theirs: ArrayLike, *, confidence: float
         return Interval(difference, np.nan, np.nan)
     if not first.var() + second.var():
         return Interval(difference, difference, difference)
-    found = scipy.stats.ttest_ind(first, second, equal_var=False).confidence_interval(_checked(confidence))
+    from scipy import stats  # takes most of a second to import
+
+    found = stats.ttest_ind(first, second, equal_var=False).confidence_interval(_checked(confidence))
     return Interval(difference, float(found.low), float(found.high))
 
 
@@ -208,8 +209,10 @@ def permutation_test(ours: ArrayLike, theirs: ArrayLike) -> float:
         return np.mean(x, axis) - np.mean(y, axis)
 
     sides = (_finite(ours, 1), _finite(theirs, 1))
+    from scipy import stats  # takes most of a second to import
+
     # In batches, or all ways would be held at a time.
-    found = scipy.stats.permutation_test(sides, difference, n_resamples=np.inf, batch=10_000, vectorized=True)
+    found = stats.permutation_test(sides, difference, n_resamples=np.inf, batch=10_000, vectorized=True)
     return float(found.pvalue)
 
 

@@ -57,6 +57,10 @@ class Suite:
         trees: TaskTree = jax.tree.map(lambda x: x[rows], self.trees)
         return Suite(self.name, tuple(self.formulas[row] for row in rows), trees)
 
+    def padded(self, num_nodes: int) -> Suite:
+        """The same tasks with N = ``num_nodes``, or more if they need it."""
+        return Suite(self.name, self.formulas, _stack(_each(self.trees), num_nodes))
+
 
 def suite_from_text(name: str, text: str, propositions: Sequence[str], *, max_nodes: int = MAX_NODES) -> Suite:
     """Reads a suite: one formula a line; ``#`` begins a comment, blank lines are skipped.
@@ -75,7 +79,7 @@ def suite_from_text(name: str, text: str, propositions: Sequence[str], *, max_no
         if not line.strip():
             continue
         try:
-            trees.append(spec.compile_task(parse(line, line=number), propositions, max_nodes))
+            trees.append(spec.compile_task(parse(line, line=number), propositions, max_nodes, on_host=True))
         except SpecError as error:
             raise SpecError(error.message, number, error.column or 1, name) from None
         formulas.append(" ".join(line.split()))
@@ -86,17 +90,22 @@ def suite_from_text(name: str, text: str, propositions: Sequence[str], *, max_no
 
 def suite_from_trees(name: str, trees: TaskTree, propositions: Sequence[str]) -> Suite:
     """A suite of given trees (leading axis M), such as a sampler's."""
-    trees = jax.tree.map(np.asarray, trees)
-    each = [jax.tree.map(lambda x, i=i: x[i], trees) for i in range(trees.parent.shape[0])]
+    each = _each(trees)
     return Suite(name, tuple(tree_to_text(tree, propositions) for tree in each), _stack(each))
 
 
-def _stack(trees: Sequence[TaskTree]) -> TaskTree:
-    """One stack with the smallest N that holds them all, rounded up."""
+def _each(trees: TaskTree) -> list[TaskTree]:
+    """The trees of a stack, numpy leaves."""
+    trees = jax.tree.map(np.asarray, trees)
+    return [jax.tree.map(lambda x, i=i: x[i], trees) for i in range(trees.parent.shape[0])]
+
+
+def _stack(trees: Sequence[TaskTree], least: int = 0) -> TaskTree:
+    """One stack with the smallest N that holds them all, rounded up, and is at least so large."""
     numpy_trees = [jax.tree.map(np.asarray, tree) for tree in trees]
     # Parents come before their children and padding last, so nodes beyond the last valid one can go.
     needed = max(int(np.flatnonzero(tree.valid).max()) + 1 for tree in numpy_trees)
-    size = -(-needed // NODES_MULTIPLE) * NODES_MULTIPLE
+    size = max(-(-needed // NODES_MULTIPLE) * NODES_MULTIPLE, least)
     stacked: TaskTree = jax.tree.map(lambda *leaves: np.stack(leaves), *[_resize(tree, size) for tree in numpy_trees])
     return stacked
 

@@ -31,12 +31,14 @@ class Source:
         load: the agent, and facts that a report of it begins with.
         run: its run folder, if it has one.
         seed: that it was trained with.
+        foreign: whether its environment or its method is not of this library.
     """
 
     preset: Preset
     load: Callable[[], tuple[TrainedAgent, dict[str, Any]]]
     run: Path | None
     seed: int
+    foreign: bool = False
 
     def suite(self, name: str) -> Suite:
         """A suite of its environment.
@@ -135,7 +137,7 @@ def _in_run(run: Path, step: int | None) -> Source:
         facts = {"run": str(run), "checkpoint_step": found, "reward_set": experiment.reward_set}
         return TrainedAgent(agent, params, experiment.rewards), facts
 
-    return Source(experiment.preset, load, run, experiment.seed)
+    return Source(experiment.preset, load, run, experiment.seed, experiment.is_foreign)
 
 
 def _load_params(agent: Agent, run: Path, step: int | None) -> tuple[Params, int]:

@@ -13,7 +13,6 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from scipy.optimize import Bounds, LinearConstraint, milp
 
 from hrlspec.spec.ltl.automaton import Automaton
 
@@ -90,6 +89,8 @@ def _text(on: frozenset[int], off: frozenset[int], names: Sequence[str]) -> str:
 
 def _cover(on: Collection[int], off: Collection[int]) -> list[_Cube]:
     """The fewest conjunctions that hold on all of ``on`` and on none of ``off``, and of those the shortest."""
+    from scipy.optimize import Bounds, LinearConstraint, milp  # takes a third of a second to import
+
     primes = sorted({_Cube(named, code & named) for code in on for named in _hitting({code ^ other for other in off})})
     covers = np.array([[code & cube.named == cube.holding for cube in primes] for code in on])
     literals = np.array([cube.named.bit_count() for cube in primes])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Bool, Int32
 
@@ -63,6 +63,6 @@ def subtask_avoid(tree: TaskTree) -> Bool[Array, "N P"]:
     For siblings that reach conjunctions this forbids more than eq. (2) does: ¬(b∧c) becomes ¬b and ¬c.
     """
     siblings = (tree.parent[:, None] == tree.parent[None, :]) & tree.edges[:, None] & tree.edges[None, :]
-    siblings &= ~jnp.eye(tree.num_nodes, dtype=bool)
-    reached_by_siblings = (siblings.astype(jnp.float32) @ tree.reach.astype(jnp.float32)) > 0
+    siblings = siblings & ~np.eye(tree.num_nodes, dtype=bool)
+    reached_by_siblings = (siblings.astype(np.float32) @ tree.reach.astype(np.float32)) > 0
     return tree.avoid | (reached_by_siblings & ~tree.reach)

@@ -9,14 +9,11 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-import jax
-import numpy as np
 from tyro.conf import UseAppendAction
 
 from envs_jax import Environment
 from envs_jax.base import Layout
 from hrlspec.config import Checked, setting
-from hrlspec.evaluation import ltl_suite, record_episodes, suite_from_text
 from hrlspec.run import platform
 from hrlspec.run.console import result_console
 from hrlspec.run.errors import UserError
@@ -24,8 +21,10 @@ from hrlspec.run.flags import parse_flags
 from hrlspec.run.folder import check_writable
 from hrlspec.run.replay.data import Played, page_data
 from hrlspec.run.replay.page import page
+from hrlspec.run.replay.recorder import draw_layouts, record
+from hrlspec.run.replay.tasks import read_task
 from hrlspec.run.trained import Source, check_shield, find_trained
-from hrlspec.spec import TaskTree, bare_lines
+from hrlspec.spec import TaskTree
 from hrlspec.spec.automata import Automata
 
 MOST_AGENTS = 2
@@ -87,8 +86,8 @@ def main(argv: Sequence[str], *, program: str = "hrlspec replay") -> None:
     env = _common_world(agents)
     formula, tasks = _task(flags, env)
     platform.prepare()
-    keys = jax.random.split(jax.random.key(flags.seed), flags.episodes)
-    layouts = jax.tree.map(np.asarray, jax.vmap(env.sample_layout, (0, None))(keys, env.default_params))
+    kept = not any(agent.source.foreign for agent in agents)
+    layouts = draw_layouts(env, flags.seed, flags.episodes, kept=kept)
     played = [_play(agent, flags, tasks, layouts) for agent in agents]
     text = page(page_data(env, formula, tasks, layouts, played))
     flags.out.parent.mkdir(parents=True, exist_ok=True)
@@ -133,10 +132,9 @@ def _task(flags: ReplayFlags, env: Environment) -> tuple[str, TaskTree | Automat
         SpecError: it cannot be read, or is too large.
         UserError: there is more than one.
     """
-    text = " ".join(bare_lines(flags.ltl or flags.spec or "")).strip()
     if flags.ltl is not None:
-        return text, ltl_suite("--ltl", text, env, forever=flags.forever).automata
-    return text, suite_from_text("--spec", text, env.propositions).trees
+        return read_task("--ltl", "ltl", flags.ltl, env, forever=flags.forever)
+    return read_task("--spec", "spec", flags.spec or "", env)
 
 
 def _play(shown: _Shown, flags: ReplayFlags, tasks: TaskTree | Automata, layouts: Layout) -> Played:
@@ -144,18 +142,8 @@ def _play(shown: _Shown, flags: ReplayFlags, tasks: TaskTree | Automata, layouts
     trained, _ = shown.source.load()
     if flags.shield:
         check_shield(trained)
-    episodes, record = record_episodes(
-        jax.random.fold_in(jax.random.key(flags.seed), 1),
-        trained.agent,
-        trained.params,
-        trained.rewards,
-        tasks,
-        layouts,
-        which=np.zeros(flags.episodes, int),
-        greedy=flags.greedy,
-        shield=flags.shield,
-    )
-    return Played(shown.name, trained.agent.method.name, *jax.device_get((episodes, record)))
+    how = {"greedy": flags.greedy, "shield": flags.shield, "kept": not shown.source.foreign}
+    return Played(shown.name, trained.agent.method.name, *record(trained, flags.seed, tasks, layouts, **how))
 
 
 def _check(flags: ReplayFlags) -> None:
