@@ -19,9 +19,11 @@ from envs_jax.base import (
     EnvParams,
     FiniteGraph,
     GridMap,
+    Rearrangeable,
     Reflections,
     Symmetric,
     Symmetries,
+    Thing,
 )
 from envs_jax.layouts import load_layouts, save_layouts
 from envs_jax.letter.world import Letter, LetterState
@@ -39,9 +41,11 @@ __all__ = [
     "GridMap",
     "Letter",
     "LetterState",
+    "Rearrangeable",
     "Reflections",
     "Symmetric",
     "Symmetries",
+    "Thing",
     "Walk",
     "WalkLayout",
     "WalkState",

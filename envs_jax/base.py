@@ -381,3 +381,36 @@ class Drawable(Environment):
     @abc.abstractmethod
     def position(self, state: State) -> Shaped[Array, " _"]:
         """Where the agent is, in the scene's coordinates, ``[2]``, or ``[3]`` with its heading in radians."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Thing:
+    """Something in a layout that can be moved.
+
+    Attributes:
+        name: the proposition that it stands for; empty for the agent, where it starts.
+        place: in the scene's coordinates.
+    """
+
+    name: str
+    place: tuple[float, float]
+
+
+class Rearrangeable(Drawable):
+    """An environment whose layouts can be changed by hand."""
+
+    @abc.abstractmethod
+    def things(self, layout: Layout) -> tuple[Thing, ...]:
+        """What can be moved in an unbatched layout (numpy leaves). On the host."""
+
+    @abc.abstractmethod
+    def rearranged(self, layout: Layout, places: Float[np.ndarray, "_ 2"]) -> Layout:
+        """The same layout (numpy leaves) with its things elsewhere. On the host.
+
+        Args:
+            layout: unbatched, numpy leaves.
+            places: finite, in the scene's coordinates, one for each thing in the order of :meth:`things`.
+
+        Raises:
+            ValueError: they cannot lie there.
+        """

@@ -14,19 +14,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Bool, Float32, Int, Int8, Int32, Key, Shaped, UInt32
+from jaxtyping import Bool, Float, Float32, Int, Int8, Int32, Key, Shaped, UInt32
 
 from envs_jax.arrays import Array
 from envs_jax.base import (
     Box,
     ContestedLayouts,
     Discrete,
-    Drawable,
     EnvParams,
     FiniteGraph,
+    Rearrangeable,
     StepResult,
     Symmetric,
     Symmetries,
+    Thing,
     at_most_one,
 )
 from envs_jax.letter.contested import most_contested, myopia_regret
@@ -62,7 +63,7 @@ class LetterState:
 
 
 @dataclasses.dataclass(frozen=True)
-class Letter(Symmetric, FiniteGraph, ContestedLayouts, Drawable):
+class Letter(Symmetric, FiniteGraph, ContestedLayouts, Rearrangeable):
     """The Letter world.
 
     Layout: int8 ``[n, n]``; ``num_cells / num_letters`` cells for each letter, placed uniformly over the cells
@@ -290,6 +291,22 @@ class Letter(Symmetric, FiniteGraph, ContestedLayouts, Drawable):
         """Row and column, int32 ``[2]``."""
         return state.position
 
+    def things(self, layout: Int[np.ndarray, "n n"]) -> tuple[Thing, ...]:
+        """The letters. The start is not among them: on a torus moving all letters is the same."""
+        return tuple(Thing(self.propositions[layout[row, column]], (row, column)) for row, column in _lettered(layout))
+
+    def rearranged(self, layout: Int[np.ndarray, "n n"], places: Float[np.ndarray, "_ 2"]) -> Int8[np.ndarray, "n n"]:
+        """See :meth:`Rearrangeable.rearranged`; each letter has a cell for itself, and the start has none."""
+        cells = places.astype(int)
+        if not ((cells >= 0) & (cells < self.size)).all():
+            raise ValueError(f"a letter lies outside of the grid of {self.size}×{self.size} cells")
+        moved = np.full_like(layout, NO_LETTER)
+        moved[tuple(cells.T)] = layout[tuple(_lettered(layout).T)]
+        if (moved != NO_LETTER).sum() < len(cells):
+            raise ValueError("two letters are in one cell")
+        self.check_layout(moved)
+        return moved
+
     def _place_letters(self, key: Key[Array, ""]) -> Int8[Array, "n n"]:
         """Letters on uniformly drawn cells other than (0, 0), int8 ``[n, n]``.
 
@@ -339,6 +356,11 @@ def _with_neighbours(cells: Bool[np.ndarray, "*lead n n"]) -> Bool[np.ndarray, "
     rows = np.roll(cells, 1, -2) | np.roll(cells, -1, -2)
     columns = np.roll(cells, 1, -1) | np.roll(cells, -1, -1)
     return cells | rows | columns
+
+
+def _lettered(layout: Int[np.ndarray, "n n"]) -> Int[np.ndarray, "_ 2"]:
+    """Row and column of the cells that bear a letter."""
+    return np.argwhere(layout != NO_LETTER)
 
 
 def _successors(size: int) -> Int32[np.ndarray, "S A"]:

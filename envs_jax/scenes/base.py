@@ -112,3 +112,7 @@ class Scene(abc.ABC):
             float ``[t + 1, 2]``, x and y, or ``[t + 1, 3]`` with a heading in radians, clockwise from the right.
         """
         return np.asarray(positions, float)
+
+    def from_outline(self, places: np.ndarray) -> np.ndarray:
+        """Places ``[_, 2]``, x and y in the outline, as positions, float ``[_, 2]``."""
+        return np.asarray(places, float)

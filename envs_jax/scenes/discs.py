@@ -133,6 +133,10 @@ class DiscScene(Scene):
         path[:, 2:] *= -1
         return path
 
+    def from_outline(self, places: np.ndarray) -> np.ndarray:
+        """See :class:`Scene`."""
+        return np.stack([places[:, 0] + self.low, self.high - places[:, 1]], -1)
+
     def _draw_regions(self, ax: Axes, chosen: Collection[int], avoided: Collection[str]) -> None:
         """The regions with their names, on axes of equal scale without ticks."""
         from matplotlib.patches import Circle, Rectangle

@@ -106,6 +106,10 @@ class GridScene(Scene):
         """See :class:`Scene`."""
         return np.asarray(positions, float)[:, ::-1] + 0.5
 
+    def from_outline(self, places: np.ndarray) -> np.ndarray:
+        """See :class:`Scene`: rows and columns."""
+        return np.floor(places)[:, ::-1]
+
     def _inside(self, position: np.ndarray) -> tuple[int, int]:
         """A position as row and column, or ``ValueError``."""
         where = np.asarray(position)

@@ -18,7 +18,7 @@ from flax import struct
 from jaxtyping import Bool, Float, Float32, Int, Int32, Key, Shaped
 
 from envs_jax.arrays import Array
-from envs_jax.base import Box, Drawable, EnvParams, GridMap, StepResult
+from envs_jax.base import Box, EnvParams, GridMap, Rearrangeable, StepResult, Thing
 from envs_jax.scenes import DiscScene, Region
 
 NO_DISC = -1.0
@@ -85,7 +85,7 @@ class WalkState:
 
 
 @dataclasses.dataclass(frozen=True)
-class Walk(GridMap, Drawable):
+class Walk(GridMap, Rearrangeable):
     """The Walk world: a square, round regions that may overlap, a point that moves where it is told.
 
     Only the position is observed, so an agent has to learn where the regions are: they are the same in every episode
@@ -297,6 +297,17 @@ class Walk(GridMap, Drawable):
     def position(self, state: WalkState) -> Shaped[Array, " _"]:
         """The point, float32 ``[2]``, x and y."""
         return state.position
+
+    def things(self, layout: WalkLayout) -> tuple[Thing, ...]:
+        """The start alone: an agent knows by heart where the regions are."""
+        x, y = np.asarray(layout.start).tolist()
+        return (Thing("", (x, y)),)
+
+    def rearranged(self, layout: WalkLayout, places: Float[np.ndarray, "_ 2"]) -> WalkLayout:
+        """See :meth:`Rearrangeable.rearranged`; the start must be free ground."""
+        moved = WalkLayout(start=places[0].astype(np.float32), discs=layout.discs)  # type: ignore[arg-type]
+        self.check_layout(moved)
+        return moved
 
     def _layout(self) -> WalkLayout:
         """The environment's own layout (numpy), with the square's corner for a start that is still to be drawn."""

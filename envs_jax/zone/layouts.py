@@ -5,6 +5,8 @@ Axes: **P** = 4 colours, **Z** = 2 zones of each.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +14,7 @@ from flax import struct
 from jaxtyping import Bool, Float, Int32, Key
 
 from envs_jax.arrays import Array
+from envs_jax.base import Thing
 
 COLOURS = ("blue", "green", "red", "yellow")
 ZONES_EACH = 2
@@ -79,6 +82,29 @@ def new_layout(key: Key[Array, ""], layout: ZoneLayout, needed: Bool[Array, ""])
 def no_layout() -> ZoneLayout:
     """Like no layout that is ever drawn."""
     return ZoneLayout(robot=jnp.zeros(3, jnp.float32), zones=jnp.zeros((len(COLOURS), ZONES_EACH, 2), jnp.float32))
+
+
+def things_in(layout: ZoneLayout, names: Sequence[str]) -> tuple[Thing, ...]:
+    """Zones in the order of their colours, and the robot."""
+    zones = [Thing(name, (x, y)) for name, some in zip(names, layout.zones.tolist(), strict=True) for x, y in some]
+    x, y = layout.robot[:2].tolist()
+    return (*zones, Thing("", (x, y)))
+
+
+def rearranged(layout: ZoneLayout, places: Float[np.ndarray, "_ 2"], radius: float) -> ZoneLayout:
+    """The same layout with zones and robot elsewhere; it keeps its heading.
+
+    Raises:
+        ValueError: two zones overlap.
+    """
+    *zones, robot = places.astype(np.float32)
+    apart = np.linalg.norm(places[:-1, None] - places[:-1], axis=-1) + np.diag(np.full(len(zones), np.inf))
+    if apart.min() < 2 * radius:
+        raise ValueError("two zones overlap")
+    return ZoneLayout(
+        robot=np.concatenate([robot, layout.robot[2:]]),  # type: ignore[arg-type]
+        zones=np.reshape(zones, layout.zones.shape),  # type: ignore[arg-type]
+    )
 
 
 def _place_next(draw: _Draw, previous: Float[Array, "objects 2"]) -> _Draw:

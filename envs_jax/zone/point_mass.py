@@ -18,10 +18,10 @@ from flax import struct
 from jaxtyping import Bool, Float, Float32, Int32, Key, Shaped
 
 from envs_jax.arrays import Array
-from envs_jax.base import Box, Drawable, EnvParams, StepResult, at_most_one
+from envs_jax.base import Box, EnvParams, Rearrangeable, StepResult, Thing, at_most_one
 from envs_jax.scenes import DiscScene, Region
 from envs_jax.zone.contested import Contests
-from envs_jax.zone.layouts import NUM_ZONES, ZONES_EACH, ZoneLayout, no_layout
+from envs_jax.zone.layouts import NUM_ZONES, ZONES_EACH, ZoneLayout, no_layout, rearranged, things_in
 from envs_jax.zone.world import LIDAR_BINS, lidar_readings
 
 COLOURS = ("red", "green", "purple", "yellow")
@@ -84,7 +84,7 @@ class PointMassState:
 
 
 @dataclasses.dataclass(frozen=True)
-class PointMass(Contests, Drawable):
+class PointMass(Contests, Rearrangeable):
     """Zone with a point mass.
 
     Layout: a `ZoneLayout`. Observation: float32 ``[69]``: acceleration and velocity along x and y, turn rate, and a
@@ -237,6 +237,16 @@ class PointMass(Contests, Drawable):
     def position(self, state: PointMassState) -> Shaped[Array, " _"]:
         """The robot, float ``[3]``: x, y (m) and heading (rad)."""
         return jnp.concatenate([state.position, state.heading[..., None]], -1)
+
+    def things(self, layout: ZoneLayout) -> tuple[Thing, ...]:
+        """Zones and robot."""
+        return things_in(layout, COLOURS)
+
+    def rearranged(self, layout: ZoneLayout, places: Float[np.ndarray, "_ 2"]) -> ZoneLayout:
+        """See :meth:`Rearrangeable.rearranged`; zones do not overlap, and the robot keeps its heading."""
+        moved = rearranged(layout, places, RADIUS)
+        self.check_layout(moved)
+        return moved
 
     def _gone(self, touched: Bool[Array, " P"]) -> Bool[Array, " P"]:
         """Colours that are gone after these were touched."""

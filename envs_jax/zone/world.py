@@ -19,17 +19,18 @@ from jaxtyping import Bool, Float, Float32, Int32, Key, Shaped
 from envs_jax.arrays import Array
 from envs_jax.base import (
     Box,
-    Drawable,
     EnvParams,
+    Rearrangeable,
     Reflections,
     StepResult,
     Symmetric,
+    Thing,
     at_most_one,
 )
 from envs_jax.scenes import DiscScene, Region
 from envs_jax.zone import physics as zone_physics
 from envs_jax.zone.contested import Contests
-from envs_jax.zone.layouts import COLOURS, ZoneLayout, new_layout, no_layout
+from envs_jax.zone.layouts import COLOURS, ZoneLayout, new_layout, no_layout, rearranged, things_in
 from envs_jax.zone.physics import NUM_SENSORS, Backend, import_mjx
 
 LIDAR_BINS = 16
@@ -61,7 +62,7 @@ class ZoneState:
 
 
 @dataclasses.dataclass(frozen=True)
-class Zone(Symmetric, Contests, Drawable):
+class Zone(Symmetric, Contests, Rearrangeable):
     """The Zone world.
 
     Layout: a `ZoneLayout`, the robot's pose and two zones of each colour. Observation: float32 ``[80]``:
@@ -266,6 +267,16 @@ class Zone(Symmetric, Contests, Drawable):
     def position(self, state: ZoneState) -> Shaped[Array, " _"]:
         """The robot, float ``[3]``: x, y (m) and heading (rad)."""
         return state.body[:3]
+
+    def things(self, layout: ZoneLayout) -> tuple[Thing, ...]:
+        """Zones and robot."""
+        return things_in(layout, COLOURS)
+
+    def rearranged(self, layout: ZoneLayout, places: Float[np.ndarray, "_ 2"]) -> ZoneLayout:
+        """See :meth:`Rearrangeable.rearranged`; zones do not overlap, and the robot keeps its heading."""
+        moved = rearranged(layout, places, self.radius)
+        self.check_layout(moved)
+        return moved
 
     @property
     def _physics_step(self) -> zone_physics.Step:

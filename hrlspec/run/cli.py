@@ -19,6 +19,7 @@ COMMANDS = {
     "run": "train an agent, evaluate it on unseen tasks, draw what it does",
     "evaluate": "evaluate a trained agent on tasks of your own, or draw it",
     "replay": "a page that plays episodes of trained agents, with what they thought",
+    "play": "a page, served on this machine, where you type a task and watch an agent carry it out",
     "export": "an agent as a file of parameters and a card that says what it is",
     "runs": "the run folders there are, and how far each has come",
     "compare": "learning curves, results and differing settings of several runs",

@@ -77,7 +77,7 @@ def page_data(
         "names": names,
         "tasks": {row: _tree(jax.tree.map(lambda x, row=row: x[row], trees)) for row in sorted(visited)},
         "automaton": None if automata is None else _automaton(automata, names),
-        "scenes": [_scene(scene) for scene in scenes],
+        "scenes": [scene_data(scene) for scene in scenes],
         "runs": runs,
     }
 
@@ -96,7 +96,7 @@ def _episode(played: Played, index: int, scene: Scene | None, *, one_task: bool)
         "rounds": int(ended.rounds),
         "return": _rounded(ended.returns),
         "steps": steps,
-        "places": _places(np.asarray(whole.position), scene),
+        "places": places_data(np.asarray(whole.position), scene),
         "labels": _changes([_members(row)] for row in whole.labels),
         "standing": _changes(
             [int(row), int(node), _members(blocked)]
@@ -119,14 +119,15 @@ def _episode(played: Played, index: int, scene: Scene | None, *, one_task: bool)
     }
 
 
-def _places(positions: np.ndarray, scene: Scene | None) -> list[list[float | None]] | None:
-    """Where the agent is in the scene's outline: x, y and perhaps a heading, each ``[T + 1]``."""
+def places_data(positions: np.ndarray, scene: Scene | None) -> list[list[float | None]] | None:
+    """Positions ``[_, D]`` in the scene's outline: x, y and perhaps a heading, each ``[_]``; ``None`` likewise."""
     if scene is None or scene.outline() is None:
         return None
     return [[_rounded(number) for number in column] for column in scene.in_outline(positions).T]
 
 
-def _scene(scene: Scene | None) -> Json | None:
+def scene_data(scene: Scene | None) -> Json | None:
+    """A layout as shapes; ``None`` where there is nothing to see."""
     outline = None if scene is None else scene.outline()
     if outline is None:
         return None

@@ -4,13 +4,12 @@ const SECONDS = 12; // that an episode takes at the speed it begins with
 const JUMP = 10;
 const CLICKED = new Set(["BUTTON", "SUMMARY", "INPUT", "SELECT", "A"]);
 
-const player = { step: 0, length: 1, panels: [], playing: false, since: 0 };
-const bounds = boundsOf(RECORD.runs);
+const player = { step: 0, length: 1, bounds: [0, 1], panels: [], playing: false, since: 0 };
 
 function openEpisode(episode) {
   pause();
   player.length = Math.max(1, ...RECORD.runs.map((run) => run.episodes[episode].steps));
-  player.panels = RECORD.runs.map((run, number) => makePanel(run, number, episode, player.length, bounds, seek));
+  player.panels = RECORD.runs.map((run, number) => makePanel(run, number, episode, player.length, player.bounds, seek));
   byId("panels").replaceChildren(...player.panels.map(({ node }) => node));
   byId("episode").value = String(episode);
   byId("step").max = String(player.length);
@@ -100,19 +99,32 @@ function onKey(event) {
   const onSlider = target.id === "step";
   const action = NAMED[key] ?? (byId("keys").checked ? CHARACTERS[key.toLowerCase()] : undefined);
   // What has the focus keeps the keys that it uses itself.
-  if (!action || (target.tagName === "SELECT") || (key === " " && !onSlider && CLICKED.has(target.tagName))) return;
+  if (!action || byId("panels").hidden || target.matches("select, textarea") || (key === " " && !onSlider && CLICKED.has(target.tagName))) return;
   if (key in NAMED && target.classList.contains("scroll")) return;
   event.preventDefault();
   action(event);
 }
 
-function begin() {
-  byId("world").textContent = `Replay · ${RECORD.world}`;
+function openRecord(record) {
+  RECORD = record;
+  player.bounds = boundsOf(RECORD.runs);
+  byId("world").textContent = ` · ${RECORD.world}`;
+  byId("formula").textContent = RECORD.formula;
   byId("panels").className = RECORD.runs.length > 1 ? "two" : "one";
-  RECORD.scenes.forEach((_, number) => {
+  byId("episode").replaceChildren(...RECORD.scenes.map((_, number) => {
     const ended = RECORD.runs.map(({ episodes }) => `${outcomeOf(episodes[number])}, ${plural(episodes[number].steps, "step")}`);
-    byId("episode").append(html("option", { value: number }, `${number + 1}: ${ended.join("  |  ")}`));
-  });
+    return html("option", { value: number }, `${number + 1}: ${ended.join("  |  ")}`);
+  }));
+  byId("episodes").hidden = RECORD.scenes.length === 1;
+  showPlayer(true);
+  openEpisode(0);
+}
+
+function showPlayer(shown) {
+  for (const part of document.querySelectorAll("#panels, .legend, .transport")) part.hidden = !shown;
+}
+
+function begin() {
   for (const speed of SPEEDS) byId("speed").append(html("option", { value: speed }, `${speed} / s`));
   drawLegend();
   const clicks = {
@@ -123,7 +135,7 @@ function begin() {
   byId("step").addEventListener("input", ({ target }) => seek(Number(target.value)));
   byId("episode").addEventListener("change", ({ target }) => openEpisode(Number(target.value)));
   document.addEventListener("keydown", onKey);
-  openEpisode(0);
+  if (RECORD) openRecord(RECORD);
 }
 
 begin();

@@ -1,5 +1,5 @@
 // Reading the record: what held at a step. Lists of changes begin with the step from which they hold.
-const RECORD = JSON.parse(byId("record").textContent);
+let RECORD = JSON.parse(byId("record").textContent);
 const ROOT = 0;
 
 function at(changes, step) {

@@ -1,0 +1,220 @@
+// Trying an agent: a task is typed, the layout's things are moved, and what comes back is played.
+const BEGIN = JSON.parse(byId("begin").textContent);
+const LANGUAGES = { spec: "SPECTRL", ltl: "LTL" };
+const PATIENCE = 60000; // milliseconds
+const FINE = 60; // steps of an arrow key across a world without cells
+const FAR = 5; // such steps with Shift
+const TURNS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+
+let layout = BEGIN.arrangement; // as it is shown
+let places = null; // what was moved by hand, once anything was
+let draws = layout.seed; // seeds of random numbers: each try has its own
+let latest = Promise.resolve(); // one request after the other
+
+class Refusal extends Error {}
+
+async function ask(path, request) {
+  const body = JSON.stringify(request);
+  let answer;
+  try {
+    answer = await fetch(path, { method: "POST", headers: { "Content-Type": "application/json" }, body, signal: AbortSignal.timeout(PATIENCE) });
+  } catch {
+    throw new Refusal("Nothing answers. Is the command still running?");
+  }
+  const found = await answer.json().catch(() => ({ message: `status ${answer.status}` }));
+  if (!answer.ok) throw Object.assign(new Refusal(found.message), { line: found.line, column: found.column });
+  return found;
+}
+
+function inTurn(work) {
+  latest = latest.then(work).catch((error) => complain(error));
+  return latest;
+}
+
+function complain(error) {
+  const where = error.column ? `Line ${error.line ?? 1}, column ${error.column}: ` : "";
+  byId("problem").textContent = `${where}${error.message}`;
+  byId("task").setAttribute("aria-invalid", String(Boolean(error.column)));
+  if (!error.column) return;
+  const at = [...byId("task").value].slice(0, error.column - 1).join("").length; // columns count characters
+  byId("task").focus();
+  byId("task").setSelectionRange(at, at + 1);
+}
+
+function settle() {
+  byId("problem").textContent = "";
+  byId("notes").textContent = "";
+  byId("task").setAttribute("aria-invalid", "false");
+}
+
+function go() {
+  if (byId("go").getAttribute("aria-disabled") === "true") return latest;
+  byId("go").setAttribute("aria-disabled", "true");
+  const language = byId("language").value;
+  const request = {
+    language, task: byId("task").value, forever: language === "ltl" && byId("forever").checked,
+    seed: layout.seed, places, draw: draws,
+  };
+  return inTurn(async () => {
+    settle();
+    const record = await ask("episode", request);
+    draws += 1;
+    byId("notes").textContent = record.notes.join(" ");
+    showArranging(false);
+    openRecord(record);
+    if (!matchMedia("(prefers-reduced-motion: reduce)").matches) play();
+  }).finally(() => byId("go").setAttribute("aria-disabled", "false"));
+}
+
+function showArranging(shown) {
+  byId("arrange").hidden = !shown;
+  byId("change").hidden = shown;
+  if (!shown) return;
+  pause();
+  showPlayer(false);
+  byId("formula").textContent = document.title.slice("Play: ".length);
+  drawArrangement();
+}
+
+// A layout that was drawn, or changed; the one that is shown stays if it is refused.
+function arrange(seed, wanted, focused) {
+  return inTurn(async () => {
+    settle();
+    try {
+      layout = await ask("layout", { seed, places: wanted });
+      places = wanted;
+    } finally {
+      drawArrangement(focused);
+    }
+    const moved = layout.things[focused];
+    byId("spoken").textContent = moved ? `${nameOf(moved)}: ${placeOf(moved)}.` : "New layout.";
+  });
+}
+
+const nameOf = ([name]) => name || "the agent";
+const inWords = (number) => String(Math.round(100 * number) / 100);
+const placeOf = ([, x, y]) => {
+  const { cell } = layout.scene;
+  return cell ? `row ${Math.ceil(y / cell)}, column ${Math.ceil(x / cell)}` : `${inWords(x)} from the left, ${inWords(y)} from above`;
+};
+
+// Moving a thing: within the world, from cell to cell where there are cells; what lies there already takes its place.
+function move(number, x, y) {
+  const { width, height, cell } = layout.scene;
+  const [wide, high] = [[x, width], [y, height]].map(([some, most]) => {
+    if (!cell) return Math.max(0, Math.min(most, some));
+    return (Math.max(0, Math.min(most / cell - 1, Math.floor(some / cell))) + 0.5) * cell;
+  });
+  const wanted = layout.things.map(([, left, top]) => [left, top]);
+  const there = cell ? wanted.findIndex(([left, top]) => Math.hypot(left - wide, top - high) < cell / 2) : -1;
+  if (there >= 0) wanted[there] = wanted[number];
+  wanted[number] = [wide, high];
+  arrange(layout.seed, wanted, number);
+}
+
+function drawArrangement(focused = -1) {
+  const { scene, agent, things } = layout;
+  byId("undo").disabled = !places;
+  byId("how").textContent = !scene ? "This world cannot be drawn." : things.length
+    ? "Drag what is outlined when it has the focus; or reach it with Tab and move it with the arrow keys, further with Shift."
+    : "Nothing can be moved in this world; there are new layouts.";
+  if (!scene) return;
+  const { width, height, cell } = scene;
+  const thin = width / 400;
+  const margin = cell ? 0 : width * 0.02;
+  const box = `${-margin} ${-margin} ${width + 2 * margin} ${height + 2 * margin}`;
+  const picture = svg("svg", { class: "map", viewBox: box, role: "group", "aria-label": "The world from above", style: `--ratio:${width / height}` });
+  if (cell) picture.append(gridLines(width, height, cell, thin));
+  const owners = new Map(things.filter(([name]) => name).map((thing) => [nearest(scene.shapes, thing), thing]));
+  const groups = [];
+  const movable = (thing, radius, ...drawing) => {
+    const group = makeMovable(picture, things.indexOf(thing), thing, radius, thin, drawing);
+    groups[things.indexOf(thing)] = group;
+    return group;
+  };
+  for (const shape of scene.shapes) {
+    const drawing = [drawShape(shape, thin), drawName(shape, thin)];
+    picture.append(...(owners.has(shape) ? [movable(owners.get(shape), shape.radius, ...drawing)] : drawing));
+  }
+  const radius = cell ? cell * CELL_AGENT : width * FREE_AGENT;
+  const body = drawAgent(radius, thin, Boolean(cell), agent.length > 2);
+  body.setAttribute("transform", `translate(${agent[0]} ${agent[1]}) rotate(${((agent[2] ?? 0) * 180) / Math.PI})`);
+  const start = things.find(([name]) => !name);
+  picture.append(start ? movable(start, 2 * radius, body) : body);
+  byId("arrangement").replaceChildren(picture);
+  groups[focused]?.focus();
+}
+
+// The shape that a thing is drawn as.
+function nearest(shapes, [name, x, y]) {
+  const own = shapes.filter((shape) => shape.name === name);
+  const far = (shape) => Math.hypot(shape.x - x, shape.y - y);
+  return own.reduce((best, shape) => (far(shape) < far(best) ? shape : best));
+}
+
+function makeMovable(picture, number, thing, radius, thin, drawing) {
+  const [, x, y] = thing;
+  const group = svg("g", { class: "thing", tabindex: "0", role: "button", "aria-label": `${nameOf(thing)}, ${placeOf(thing)}`, "aria-describedby": "how" },
+    ...drawing, svg("circle", { class: "focus", cx: x, cy: y, r: radius, "stroke-width": 4 * thin }));
+  let from = null;
+  const at = ({ clientX, clientY }) => new DOMPoint(clientX, clientY).matrixTransform(picture.getScreenCTM().inverse());
+  const by = (event) => {
+    const to = at(event);
+    return [to.x - from.x, to.y - from.y];
+  };
+  group.addEventListener("pointerdown", (event) => {
+    if (event.button) return;
+    from = at(event);
+    group.setPointerCapture(event.pointerId);
+    picture.append(group); // above the others
+  });
+  group.addEventListener("pointermove", (event) => from && group.setAttribute("transform", `translate(${by(event).join(" ")})`));
+  group.addEventListener("pointerup", (event) => {
+    if (!from) return;
+    const [dx, dy] = by(event);
+    from = null;
+    if (Math.hypot(dx, dy) > thin) move(number, x + dx, y + dy);
+    else group.focus();
+  });
+  group.addEventListener("pointercancel", () => {
+    from = null;
+    group.removeAttribute("transform");
+  });
+  group.addEventListener("keydown", (event) => {
+    const turn = TURNS[event.key];
+    if (!turn || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    const { width, cell } = layout.scene;
+    const step = (cell ?? width / FINE) * (event.shiftKey ? FAR : 1);
+    const [, left, top] = layout.things[number]; // as it is now
+    move(number, left + turn[0] * step, top + turn[1] * step);
+  });
+  return group;
+}
+
+function beginPlay() {
+  byId("world").textContent = ` · ${BEGIN.world}`;
+  for (const language of Object.keys(BEGIN.examples)) byId("language").append(html("option", { value: language }, LANGUAGES[language]));
+  byId("task").value = BEGIN.examples.spec;
+  byId("hint").textContent = `What can hold: ${BEGIN.names.join(", ")}.`;
+  byId("language").addEventListener("change", ({ target }) => {
+    byId("rounds").hidden = target.value !== "ltl";
+    if (Object.values(BEGIN.examples).includes(byId("task").value)) byId("task").value = BEGIN.examples[target.value];
+    settle();
+  });
+  byId("ask").addEventListener("submit", (event) => {
+    event.preventDefault();
+    go();
+  });
+  byId("task").addEventListener("keydown", (event) => {
+    if (event.key !== "Enter" || event.shiftKey || event.isComposing) return;
+    event.preventDefault();
+    go();
+  });
+  byId("another").addEventListener("click", () => arrange(layout.seed + 1, null));
+  byId("undo").addEventListener("click", () => arrange(layout.seed, null));
+  byId("change").addEventListener("click", () => showArranging(true));
+  showArranging(true);
+}
+
+beginPlay();
