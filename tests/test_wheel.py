@@ -14,6 +14,7 @@ import pytest
 
 from hrlspec.agent_files import packaged_agents
 from hrlspec.presets import PRESETS
+from hrlspec.run.play.page import TEMPLATES
 from hrlspec.run.replay import page
 from hrlspec.version import __version__
 from tests.run import tiny
@@ -61,6 +62,7 @@ def test_what_is_inside(wheel: Path) -> None:
         files = {f"{name}.txt" for name in preset.suites} | {"reserved.hex"}
         assert {f"hrlspec/presets/suites/{preset.name}/{file}" for file in files} <= names
     templates = {f"hrlspec/run/replay/{file}" for file in ("page.html", "page.css", *page.SCRIPTS)}
+    templates |= {f"hrlspec/run/play/{file}" for file in TEMPLATES}
     assert templates <= names
     agents = {f"hrlspec/agent_files/packaged/{name}" for name in packaged_agents()}
     assert {f"{agent}.{kind}" for agent in agents for kind in ("json", "safetensors")} <= names

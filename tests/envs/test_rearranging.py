@@ -1,4 +1,4 @@
-"""Layouts changed by hand: what was moved lies where it was put, all else is as before, and what cannot be is refused."""
+"""Layouts changed by hand: what was moved lies where it was put, the rest as before; what cannot be is refused."""
 
 from __future__ import annotations
 

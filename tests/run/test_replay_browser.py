@@ -1,14 +1,12 @@
 """The page of recorded episodes in a browser: what it shows is what was recorded, by mouse, slider and keyboard.
 
-Needs Debian's ``chromium``, or another at ``$CHROMIUM``, and the extra ``browser``. The documentation's pictures are
-written into the folder ``$SCREENSHOTS``, if that is set.
+The documentation's pictures are written into the folder ``$SCREENSHOTS``, if that is set.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import shutil
 import statistics
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,23 +15,18 @@ from typing import Any
 import pytest
 
 from hrlspec.run.replay.page import page
+from tests.run.browsing import DESKTOP, PHONE, in_the_way, launched, needs_chromium
 from tests.run.replays import played
 
-playwright = pytest.importorskip("playwright.sync_api", reason='no Playwright: pip install "hrlspec[browser]"')
-CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium: apt-get install chromium, or set CHROMIUM")
+pytestmark = needs_chromium
 
 DATA = Path(__file__).parents[1] / "data" / "replay"
-DESKTOP, PHONE = {"width": 1280, "height": 860}, {"width": 390, "height": 844}
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    with playwright.sync_playwright() as driver:
-        # Within a container there is no sandbox to be had; nothing is loaded but the page.
-        started = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+    with launched() as started:
         yield started
-        started.close()
 
 
 class Visit:
@@ -210,16 +203,12 @@ def test_nothing_stands_in_the_way_of_disabled_people(
     browser: Any, tmp_path: Path, scheme: str, viewport: dict[str, int]
 ) -> None:
     """No violation of axe-core's rules that is serious; nothing is wider than the screen."""
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="no axe-core")
     data = json.loads(json.dumps(played(ltl=True)[2]))
     visit = Visit(browser, tmp_path / "page.html", data, viewport=viewport, color_scheme=scheme)
     visit.scrub(1)
     for summary in visit.tab.locator("summary").all():
         summary.click()
-    found = axe.Axe().run(visit.tab).response["violations"]
-    bad = [(some["id"], some["nodes"][0]["html"]) for some in found if some["impact"] in ("serious", "critical")]
-    assert not bad
-    assert visit.tab.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+    assert not in_the_way(visit.tab)
     visit.tab.close()
 
 

@@ -64,10 +64,15 @@ def main(argv: Sequence[str], *, program: str = "hrlspec play") -> None:
         name = flags.pretrained or source.run.resolve().name  # type: ignore[union-attr]  # one of them is given
         game = Game(name, trained, greedy=flags.greedy, shield=flags.shield, kept=not source.foreign)
         game.warm_up()
-        server.page = play_page(game, flags.seed).encode()
-        server.answers = {
-            "/layout": lambda request: game.arranged(Arrangement.read(request)),
-            "/episode": lambda request: game.played(Attempt.read(request)),
-        }
+        offer(server, game, flags.seed)
         result_console().say(f"http://{server.hosts[0]}/ until Ctrl-C")
         server.serve_forever()
+
+
+def offer(server: Server, game: Game, seed: int) -> None:
+    """Has a server answer with a game, which begins with the layout of a seed."""
+    server.page = play_page(game, seed).encode()
+    server.answers = {
+        "/layout": lambda request: game.arranged(Arrangement.read(request)),
+        "/episode": lambda request: game.played(Attempt.read(request)),
+    }

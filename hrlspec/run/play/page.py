@@ -27,5 +27,4 @@ def play_page(game: Game, seed: int) -> str:
         "arrangement": game.arranged(Arrangement(seed, None)),
     }
     filled = string.Template(form).substitute(most=MOST_TEXT, begin=script_json(begin))
-    heading = f"{game.name} in {game.env.name}"
-    return player_page("Play", heading, None, form=filled, style=style, scripts=[script], connects="'self'")
+    return player_page("Play", game.name, None, form=filled, style=style, scripts=[script], connects="'self'")

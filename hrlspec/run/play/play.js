@@ -80,8 +80,10 @@ function showArranging(shown) {
 function arrange(seed, wanted, focused) {
   return inTurn(async () => {
     settle();
+    const before = layout.seed;
     try {
       layout = await ask("layout", { seed, places: wanted });
+      if (seed !== before) draws = seed;
       places = wanted;
     } finally {
       drawArrangement(focused);
@@ -116,7 +118,7 @@ function drawArrangement(focused = -1) {
   const { scene, agent, things } = layout;
   byId("undo").disabled = !places;
   byId("how").textContent = !scene ? "This world cannot be drawn." : things.length
-    ? "Drag what is outlined when it has the focus; or reach it with Tab and move it with the arrow keys, further with Shift."
+    ? `Drag ${things.some(([name]) => name) ? "things" : "the agent"} elsewhere, or use Tab and the arrow keys; with Shift they lead further.`
     : "Nothing can be moved in this world; there are new layouts.";
   if (!scene) return;
   const { width, height, cell } = scene;
@@ -165,8 +167,8 @@ function makeMovable(picture, number, thing, radius, thin, drawing) {
   group.addEventListener("pointerdown", (event) => {
     if (event.button) return;
     from = at(event);
-    group.setPointerCapture(event.pointerId);
     picture.append(group); // above the others
+    group.setPointerCapture(event.pointerId);
   });
   group.addEventListener("pointermove", (event) => from && group.setAttribute("transform", `translate(${by(event).join(" ")})`));
   group.addEventListener("pointerup", (event) => {

@@ -101,6 +101,4 @@ def _record(
 ) -> tuple[Episodes, Record]:
     key = jax.random.fold_in(jax.random.key(seed), 1)
     which = np.zeros(len(jax.tree.leaves(layouts)[0]), int)
-    return record_episodes(
-        key, agent, params, machine, tasks, layouts, which=which, greedy=greedy, shield=shield
-    )
+    return record_episodes(key, agent, params, machine, tasks, layouts, which=which, greedy=greedy, shield=shield)
