@@ -218,7 +218,7 @@ def test_nothing_stands_in_the_way_of_disabled_people(
 
 
 def test_picture(browser: Any, server: Server, tmp_path: Path) -> None:
-    visit = Visit(browser, server, viewport={"width": 900, "height": 720})
+    visit = Visit(browser, server, viewport={"width": 900, "height": 780})
     visit.tab.locator(".thing").nth(3).focus()
     visit.tab.keyboard.press("ArrowDown")
     visit.settled()

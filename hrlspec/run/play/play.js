@@ -129,20 +129,21 @@ function drawArrangement(focused = -1) {
   if (cell) picture.append(gridLines(width, height, cell, thin));
   const owners = new Map(things.filter(([name]) => name).map((thing) => [nearest(scene.shapes, thing), thing]));
   const groups = [];
-  const movable = (thing, radius, ...drawing) => {
-    const group = makeMovable(picture, things.indexOf(thing), thing, radius, thin, drawing);
+  const movable = (thing, ...drawing) => {
+    const group = makeMovable(picture, things.indexOf(thing), thing, thin, drawing);
     groups[things.indexOf(thing)] = group;
     return group;
   };
+  const ring = { class: "focus", "stroke-width": 4 * thin };
   for (const shape of scene.shapes) {
     const drawing = [drawShape(shape, thin), drawName(shape, thin)];
-    picture.append(...(owners.has(shape) ? [movable(owners.get(shape), shape.radius, ...drawing)] : drawing));
+    picture.append(...(owners.has(shape) ? [movable(owners.get(shape), ...drawing, formOf(shape, ring))] : drawing));
   }
   const radius = cell ? cell * CELL_AGENT : width * FREE_AGENT;
   const body = drawAgent(radius, thin, Boolean(cell), agent.length > 2);
   body.setAttribute("transform", `translate(${agent[0]} ${agent[1]}) rotate(${((agent[2] ?? 0) * 180) / Math.PI})`);
   const start = things.find(([name]) => !name);
-  picture.append(start ? movable(start, 2 * radius, body) : body);
+  picture.append(start ? movable(start, body, svg("circle", { ...ring, cx: agent[0], cy: agent[1], r: 2 * radius })) : body);
   byId("arrangement").replaceChildren(picture);
   groups[focused]?.focus();
 }
@@ -154,10 +155,9 @@ function nearest(shapes, [name, x, y]) {
   return own.reduce((best, shape) => (far(shape) < far(best) ? shape : best));
 }
 
-function makeMovable(picture, number, thing, radius, thin, drawing) {
+function makeMovable(picture, number, thing, thin, drawing) {
   const [, x, y] = thing;
-  const group = svg("g", { class: "thing", tabindex: "0", role: "button", "aria-label": `${nameOf(thing)}, ${placeOf(thing)}`, "aria-describedby": "how" },
-    ...drawing, svg("circle", { class: "focus", cx: x, cy: y, r: radius, "stroke-width": 4 * thin }));
+  const group = svg("g", { class: "thing", tabindex: "0", role: "button", "aria-label": `${nameOf(thing)}, ${placeOf(thing)}`, "aria-describedby": "how" }, ...drawing);
   let from = null;
   const at = ({ clientX, clientY }) => new DOMPoint(clientX, clientY).matrixTransform(picture.getScreenCTM().inverse());
   const by = (event) => {
