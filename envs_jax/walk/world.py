@@ -305,7 +305,7 @@ class Walk(GridMap, Rearrangeable):
 
     def rearranged(self, layout: WalkLayout, places: Float[np.ndarray, "_ 2"]) -> WalkLayout:
         """See :meth:`Rearrangeable.rearranged`; the start must be free ground."""
-        moved = WalkLayout(start=places[0].astype(np.float32), discs=layout.discs)  # type: ignore[arg-type]
+        moved = WalkLayout(start=places[0].astype(np.float32), discs=layout.discs)
         self.check_layout(moved)
         return moved
 

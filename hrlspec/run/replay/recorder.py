@@ -64,8 +64,8 @@ def record(
         Numpy leaves.
     """
     inputs = (np.int32(seed), trained.params, trained.rewards, tasks, layouts)
-    shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(inputs))
-    program = _record_program(trained.agent, greedy, shield, kept, type(tasks), shapes)
+    leaves, structure = jax.tree.flatten(inputs)
+    program = _record_program(trained.agent, greedy, shield, kept, structure, *map(np.shape, leaves))
     episodes, found = jax.device_get(program(*inputs))
     return episodes, found
 
