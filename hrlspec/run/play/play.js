@@ -77,10 +77,11 @@ function showArranging(shown) {
 }
 
 // A layout that was drawn, or changed; the one that is shown stays if it is refused.
-function arrange(seed, wanted, focused) {
+function arrange(seed, rearranged = () => null, focused = -1) {
   return inTurn(async () => {
     settle();
     const before = layout.seed;
+    const wanted = rearranged();
     try {
       layout = await ask("layout", { seed, places: wanted });
       if (seed !== before) draws = seed;
@@ -100,18 +101,20 @@ const placeOf = ([, x, y]) => {
   return cell ? `row ${Math.ceil(y / cell)}, column ${Math.ceil(x / cell)}` : `${inWords(x)} from the left, ${inWords(y)} from above`;
 };
 
-// Moving a thing: within the world, from cell to cell where there are cells; what lies there already takes its place.
-function move(number, x, y) {
+const move = (number, dx, dy) => arrange(layout.seed, () => placesAfter(number, dx, dy), number);
+
+// A thing stays within the world, and in the middle of a cell where there are cells; what lies there takes its place.
+function placesAfter(number, dx, dy) {
   const { width, height, cell } = layout.scene;
-  const [wide, high] = [[x, width], [y, height]].map(([some, most]) => {
+  const all = layout.things.map(([, x, y]) => [x, y]);
+  const [x, y] = [[all[number][0] + dx, width], [all[number][1] + dy, height]].map(([some, most]) => {
     if (!cell) return Math.max(0, Math.min(most, some));
     return (Math.max(0, Math.min(most / cell - 1, Math.floor(some / cell))) + 0.5) * cell;
   });
-  const wanted = layout.things.map(([, left, top]) => [left, top]);
-  const there = cell ? wanted.findIndex(([left, top]) => Math.hypot(left - wide, top - high) < cell / 2) : -1;
-  if (there >= 0) wanted[there] = wanted[number];
-  wanted[number] = [wide, high];
-  arrange(layout.seed, wanted, number);
+  const there = cell ? all.findIndex(([left, top]) => Math.hypot(left - x, top - y) < cell / 2) : -1;
+  if (there >= 0) all[there] = all[number];
+  all[number] = [x, y];
+  return all;
 }
 
 function drawArrangement(focused = -1) {
@@ -156,7 +159,6 @@ function nearest(shapes, [name, x, y]) {
 }
 
 function makeMovable(picture, number, thing, thin, drawing) {
-  const [, x, y] = thing;
   const group = svg("g", { class: "thing", tabindex: "0", role: "button", "aria-label": `${nameOf(thing)}, ${placeOf(thing)}`, "aria-describedby": "how" }, ...drawing);
   let from = null;
   const at = ({ clientX, clientY }) => new DOMPoint(clientX, clientY).matrixTransform(picture.getScreenCTM().inverse());
@@ -175,7 +177,7 @@ function makeMovable(picture, number, thing, thin, drawing) {
     if (!from) return;
     const [dx, dy] = by(event);
     from = null;
-    if (Math.hypot(dx, dy) > thin) move(number, x + dx, y + dy);
+    if (Math.hypot(dx, dy) > thin) move(number, dx, dy);
     else group.focus();
   });
   group.addEventListener("pointercancel", () => {
@@ -188,8 +190,7 @@ function makeMovable(picture, number, thing, thin, drawing) {
     event.preventDefault();
     const { width, cell } = layout.scene;
     const step = (cell ?? width / FINE) * (event.shiftKey ? FAR : 1);
-    const [, left, top] = layout.things[number]; // as it is now
-    move(number, left + turn[0] * step, top + turn[1] * step);
+    move(number, turn[0] * step, turn[1] * step);
   });
   return group;
 }
@@ -213,8 +214,8 @@ function beginPlay() {
     event.preventDefault();
     go();
   });
-  byId("another").addEventListener("click", () => arrange(layout.seed + 1, null));
-  byId("undo").addEventListener("click", () => arrange(layout.seed, null));
+  byId("another").addEventListener("click", () => arrange(layout.seed + 1));
+  byId("undo").addEventListener("click", () => arrange(layout.seed));
   byId("change").addEventListener("click", () => showArranging(true));
   showArranging(true);
 }

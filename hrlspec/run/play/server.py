@@ -57,9 +57,9 @@ class Server(socketserver.ThreadingTCPServer):
 
     @property
     def hosts(self) -> tuple[str, ...]:
-        """Names under which it is asked for, with the port."""
-        port = self.server_address[1]
-        return tuple(f"{name}:{port}" for name in (LOOPBACK, "localhost"))
+        """Names under which it is asked for, with the port unless it is HTTP's own."""
+        port = "" if self.server_address[1] == 80 else f":{self.server_address[1]}"
+        return LOOPBACK + port, "localhost" + port
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Shows what is a mistake of this program; who went away, or said nothing for too long, is none."""
