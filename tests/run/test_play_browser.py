@@ -187,6 +187,8 @@ def test_it_is_used_by_keyboard_alone(visit: Visit) -> None:
     tab.wait_for_selector("#panels .map")
     assert tab.evaluate("RECORD.automaton.satisfied.length") == 1
     assert tab.locator("#task").input_value().endswith(" )")  # keys that are typed do not lead the player
+    press("End")
+    assert tab.evaluate("player.step === player.length")  # but then they do
 
 
 def test_a_server_that_is_gone_is_said(browser: Any) -> None:

@@ -55,12 +55,9 @@ class Game:
         return ("spec", "ltl") if self.env.num_propositions <= MAX_PROPOSITIONS else ("spec",)
 
     def example(self, language: Language) -> str:
-        """A task of this world: one thing, then another, which a third one forbids on the way."""
-        first, *others = self.env.propositions
-        if language == "ltl":
-            return f"F ({first} & F {others[0]})" if others else f"F {first}"
-        avoiding = f" ensuring not {others[1]}" if len(others) > 1 else ""
-        return "; ".join([f"achieve {first}", *(f"achieve {other}{avoiding}" for other in others[:1])])
+        """A task of this world: one thing, then another if there is any."""
+        names = self.env.propositions[:2]
+        return f"F ({' & F '.join(names)})" if language == "ltl" else "; ".join(f"achieve {name}" for name in names)
 
     def warm_up(self) -> None:
         """Loads or compiles all programs, so that nobody waits for them later."""

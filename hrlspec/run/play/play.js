@@ -62,6 +62,7 @@ function go() {
     byId("notes").textContent = record.notes.join(" ");
     showArranging(false);
     openRecord(record);
+    byId("play").focus({ preventScroll: true }); // so that keys lead the player
     if (!matchMedia("(prefers-reduced-motion: reduce)").matches) play();
   }).finally(() => byId("go").setAttribute("aria-disabled", "false"));
 }

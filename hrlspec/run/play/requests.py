@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -69,12 +69,9 @@ class Attempt:
         Raises:
             RequestError: there is none.
         """
-        language: Literal["spec", "ltl"]
-        match request.get("language"):
-            case "spec" | "ltl" as language:
-                pass
-            case other:
-                raise RequestError(f"language is {_shown(other)}, expected spec or ltl")
+        language = request.get("language")
+        if language not in get_args(Language):
+            raise RequestError(f"language is {_shown(language)}, expected {' or '.join(get_args(Language))}")
         task, forever = request.get("task"), request.get("forever", False)
         if not isinstance(task, str):
             raise RequestError(f"task is {_shown(task)}, expected text")
