@@ -69,7 +69,7 @@ class Attempt:
         Raises:
             RequestError: there is none.
         """
-        language = request.get("language")
+        language: Any = request.get("language")
         if language not in get_args(Language):
             raise RequestError(f"language is {_shown(language)}, expected {' or '.join(get_args(Language))}")
         task, forever = request.get("task"), request.get("forever", False)
