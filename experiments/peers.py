@@ -16,23 +16,23 @@ from experiments.paper.records import read_records, record_of
 from experiments.published.comparisons import COMPARISONS
 from experiments.published.evaluations import Evaluation, evaluate, read_evaluations
 from experiments.published.report import page
+from hrlspec.config import setting
 from hrlspec.run.cli import call
 from hrlspec.run.console import PlainConsole
+from hrlspec.run.engines import EngineFlags, engine_of
 from hrlspec.run.errors import UserError
 from hrlspec.run.flags import parse_flags
 from hrlspec.run.signals import leave
 
 
 @dataclasses.dataclass(frozen=True)
-class PeersFlags:
+class PeersFlags(EngineFlags):
     """Runs and evaluates what the comparison with published results is made of, as far as it is missing."""
 
     only: tuple[str, ...] = ()
     """Worlds, such as letter12 or conveyor-simple-8; all if not given."""
-    seeds: int = NUM_SEEDS
+    seeds: int = setting(NUM_SEEDS, least=1)
     """Runs of each world, seeds 0, 1, ..."""
-    jobs: int | None = None
-    """Processes side by side; one for each accelerator or CPU core if not given."""
     out: Path | None = None
     """Records and the page, peers.md; in the checkout results/peers if not given."""
     work: Path | None = None
@@ -49,16 +49,15 @@ def main(argv: Sequence[str], *, program: str = "hrlspec peers") -> None:
         program: what to call it in messages.
 
     Raises:
-        UserError: bad usage, a run or an evaluation failed, or a damaged folder or file of records.
+        UserError: bad usage, an evaluation failed, or a damaged folder or file of records.
+        SystemExit: with a message, when runs failed; the others are done.
         Interrupted: stopped by a signal; the runs have saved what they did.
     """
     flags = parse_flags(PeersFlags, argv, program=program)
     for name in flags.only:
         if name not in COMPARISONS:
             raise UserError(f"--only {name}: there is no such world, expected some of: {', '.join(COMPARISONS)}")
-    for name, value in (("seeds", flags.seeds), ("jobs", flags.jobs)):
-        if value is not None and value < 1:
-            raise UserError(f"--{name} is {value}, expected at least 1")
+    engine = engine_of(flags)
     out = flags.out or Path("results/peers")
     work = flags.work or (flags.out / "runs" if flags.out else Path("runs/peers"))
     console = PlainConsole(stderr=True)
@@ -70,10 +69,10 @@ def main(argv: Sequence[str], *, program: str = "hrlspec peers") -> None:
     console.say(f"{len(wanted)} evaluations, {len(missing)} of them missing, and {len(runs)} runs for them")
     if flags.dry_run:
         for run in runs:
-            print(" ".join(command(run, work)[1:]))
+            print(command(run, work))
         return
     if runs:
-        make(runs, work=work, records=out, jobs=flags.jobs, console=console)
+        make(runs, work=work, records=out, engine=engine, console=console)
     for done in evaluate(missing, work=work, folder=out, jobs=flags.jobs):
         console.say(f"evaluated: {done.run.name} on {done.suite}")
     every = [Evaluation(run, suite) for some in COMPARISONS.values() for run in some.runs() for suite in some.suites]

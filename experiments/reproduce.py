@@ -25,9 +25,11 @@ from experiments.paper.panels import (
     trajectory_run,
 )
 from experiments.paper.records import read_records, record_of
+from hrlspec.config import setting
 from hrlspec.presets import RECIPES
 from hrlspec.run.cli import call
 from hrlspec.run.console import PlainConsole
+from hrlspec.run.engines import EngineFlags, engine_of
 from hrlspec.run.errors import UserError
 from hrlspec.run.extras import check_drawing
 from hrlspec.run.flags import parse_flags
@@ -35,7 +37,7 @@ from hrlspec.run.signals import leave
 
 
 @dataclasses.dataclass(frozen=True)
-class ReproduceFlags:
+class ReproduceFlags(EngineFlags):
     """Runs what the paper's figures are made of, as far as it is missing, and draws them."""
 
     only: tuple[str, ...] = ()
@@ -43,12 +45,10 @@ class ReproduceFlags:
     given."""
     recipes: tuple[str, ...] = RECIPES
     """Whose curves."""
-    seeds: int = NUM_SEEDS
+    seeds: int = setting(NUM_SEEDS, least=1)
     """Runs of each curve, seeds 0, 1, ... For tuning at most three."""
-    steps: int | None = None
+    steps: int | None = setting(None, least=1)
     """Environment steps of each run; 1.5 M in Letter, 2 M in Walk and 4 M in Zone if not given."""
-    jobs: int | None = None
-    """Runs side by side; one for each accelerator or CPU core if not given."""
     out: Path | None = None
     """Records and figures; in the checkout results/paper if not given."""
     report: Path | None = None
@@ -71,12 +71,14 @@ def main(argv: Sequence[str], *, program: str = "hrlspec reproduce") -> None:
     Raises:
         UserError: bad usage, a missing library, or a damaged folder or file of records.
         Interrupted: stopped by a signal; the runs have saved what they did.
+        SystemExit: with a message, when runs failed; the others are done.
     """
     flags = parse_flags(ReproduceFlags, argv, program=program)
     _check(flags)
     places = _places(flags)
     if not flags.dry_run:
         check_drawing()
+    engine = engine_of(flags)
     console = PlainConsole(stderr=True)
     panels = [panel for name, panel in (PANELS | TUNING).items() if name in (flags.only or PANELS)]
     runs = _runs(panels, flags)
@@ -89,11 +91,11 @@ def main(argv: Sequence[str], *, program: str = "hrlspec reproduce") -> None:
     console.say(f"{len({*runs, *missing})} runs, {len(missing)} of them missing")
     if flags.dry_run:
         for run in missing:
-            print(" ".join(command(run, places.work)[1:]))
+            print(command(run, places.work))
         return
     if not flags.draw_only:
         if missing:
-            make(missing, work=places.work, records=places.out, jobs=flags.jobs, console=console)
+            make(missing, work=places.work, records=places.out, engine=engine, console=console)
         if to_draw:
             _draw_trajectories(places.work / shown.name, picture)
             console.say(f"written: {picture}")
@@ -145,9 +147,6 @@ def _check(flags: ReproduceFlags) -> None:
     for name in flags.only:
         if name not in known:
             raise UserError(f"--only {name}: there is no such figure, expected some of: {', '.join(known)}")
-    for name, value in (("seeds", flags.seeds), ("steps", flags.steps), ("jobs", flags.jobs)):
-        if value is not None and value < 1:
-            raise UserError(f"--{name} is {value}, expected at least 1")
     for recipe in flags.recipes:
         if recipe not in RECIPES:
             raise UserError(f"--recipes {recipe}: there is no such recipe, expected some of: {', '.join(RECIPES)}")

@@ -14,11 +14,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.paper.making import Place, places
 from experiments.paper.panels import Run
 from experiments.published.comparisons import EPISODES
 from hrlspec.run.circumstances import current_commit
 from hrlspec.run.errors import UserError
+from hrlspec.run.places import Place, places
 
 FILE = "evaluations.jsonl"
 

@@ -22,6 +22,7 @@ COMMANDS = {
     "play": "a page, served on this machine, where you type a task and watch an agent carry it out",
     "export": "an agent as a file of parameters and a card that says what it is",
     "runs": "the run folders there are, and how far each has come",
+    "sweep": "many runs: a grid of settings and seeds, on this machine or a Ray cluster",
     "compare": "learning curves, results and differing settings of several runs",
     "demo": "the paper's two motivating examples, trained and drawn",
     "reproduce": "the paper's figures, in a checkout of the project",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -80,3 +81,18 @@ def check_wandb() -> None:
         raise UserError('--wandb needs the extra "wandb": pip install "hrlspec[wandb]"') from error
     except Exception as error:  # as where a library that it needs is too old
         raise UserError(f"--wandb: the library cannot be used: {in_words(error)}") from error
+
+
+def check_ray() -> None:
+    """Loads the library Ray.
+
+    Raises:
+        UserError: it is missing, or cannot be used.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # it tells nobody that it is used
+    try:
+        importlib.import_module("ray")
+    except ImportError as error:
+        raise UserError('--ray needs the extra "ray": pip install "hrlspec[ray]"') from error
+    except Exception as error:  # as where a library that it needs is too old
+        raise UserError(f"--ray: the library cannot be used: {in_words(error)}") from error

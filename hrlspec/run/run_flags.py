@@ -21,7 +21,7 @@ from hrlspec.run.lookup import method_named, preset_named
 from hrlspec.run.trained import find_file
 
 _FIRST = next(iter(PRESETS))
-_LAST_SEED = 2**31 - 1
+LAST_SEED = 2**31 - 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +41,7 @@ class RunFlags(Checked):
     hrlspec: what was measured to be better."""
     reward_set: RewardSet = 1
     """1: 1 for completing the task; 2: also for sub-tasks and for visiting some in order."""
-    seed: int = setting(0, least=0, most=_LAST_SEED)
+    seed: int = setting(0, least=0, most=LAST_SEED)
     num_seeds: int = setting(1, least=1)
     """Seeds to run one after another, from --seed on, each in a folder of its own."""
     total_steps: int | None = setting(None, least=1, most=2**40)
@@ -78,9 +78,9 @@ class RunFlags(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.seed + self.num_seeds - 1 > _LAST_SEED:
+        if self.seed + self.num_seeds - 1 > LAST_SEED:
             raise ConfigError(
-                f"RunFlags.num_seeds is {self.num_seeds}, expected the last seed to be at most {_LAST_SEED}"
+                f"RunFlags.num_seeds is {self.num_seeds}, expected the last seed to be at most {LAST_SEED}"
             )
 
 

@@ -90,7 +90,7 @@ def test_dry_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(["--only", "letter12", "conveyor-2", "--seeds", "2", "--dry-run", "--out", str(tmp_path)])
     out, err = capsys.readouterr()
     assert err == "10 evaluations, 10 of them missing, and 4 runs for them\n"
-    assert [line.split()[3] for line in out.splitlines()] == ["letter12", "letter12", "conveyor-2", "conveyor-2"]
+    assert [line.split()[4] for line in out.splitlines()] == ["letter12", "letter12", "conveyor-2", "conveyor-2"]
     assert "--evaluation.final test" in out
     assert not list(tmp_path.iterdir())
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +14,6 @@ import pytest
 
 import envs_jax
 from experiments import reproduce
-from experiments.paper import making
 from experiments.paper.claims import (
     CLAIMS,
     family,
@@ -43,8 +41,11 @@ from experiments.paper.report import write_report
 from hrlspec import compile_task, parse
 from hrlspec.methods import ImplicitPlanner
 from hrlspec.presets import RECIPES, Recipe, preset
+from hrlspec.run import engines
 from hrlspec.run.errors import Interrupted, UserError
 from hrlspec.run.experiment import Experiment
+from hrlspec.run.places import Place
+from hrlspec.run.planned import PlannedRun
 from hrlspec.run.run_flags import experiments_of, parse_run
 from tests.experiments.earlier_settings import BEFORE, before, effective
 from tests.experiments.made import record
@@ -255,20 +256,6 @@ def test_the_drawing_library_is_asked_for_first(tmp_path: Path, monkeypatch: pyt
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="cores cannot be chosen")
-def test_runs_side_by_side_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {2, 3, 5, 7})
-    monkeypatch.setattr(subprocess, "run", lambda *args, **kwargs: subprocess.CompletedProcess(args, 0, "cpu 1", ""))
-    shares = {jobs: [list(place.cores) for place in making.places(jobs)] for jobs in (None, 1, 2, 3, 6)}
-    assert shares[None] == [[2], [3], [5], [7]]
-    assert shares[1] == [[2, 3, 5, 7]]
-    assert shares[2] == [[2, 5], [3, 7]]
-    assert shares[3] == [[2, 7], [3], [5]]
-    assert shares[6] == [[2], [3], [5], [7], [2], [3]]
-    monkeypatch.setattr(subprocess, "run", lambda *args, **kwargs: subprocess.CompletedProcess(args, 0, "gpu 2", ""))
-    assert [place.variables for place in making.places(3)] == [{"CUDA_VISIBLE_DEVICES": n} for n in "010"]
-
-
 def test_a_dry_run_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     panel = PANELS["walk-set1"]
     done = panel.runs(1, None)[0]
@@ -317,21 +304,19 @@ def test_what_is_stopped_goes_on_and_what_fails_is_said(tmp_path: Path, monkeypa
     flags = ["--only", "letter-techniques", "--recipes", "paper", "--seeds", "1", "--jobs", "2", *where]
     started: list[str] = []
 
-    def command(run: Run, work: Path) -> list[str]:
+    def start(run: PlannedRun, place: Place) -> subprocess.Popen[bytes]:
         started.append(run.name)
-        if "no-shield" in run.name:
-            return [sys.executable, "-c", "raise SystemExit(2)"]
-        how = "resume" if "--resume" in making_command(run, work) else "begin"
-        return [sys.executable, "-c", STOPPED, str(work / run.name), how, *CURVE]
+        code = "raise SystemExit(2)" if "no-shield" in run.name else STOPPED
+        how = "resume" if "--resume" in run.arguments else "begin"
+        return place.start([sys.executable, "-c", code, str(run.folder), how, *CURVE])
 
-    making_command = making.command
-    monkeypatch.setattr(making, "command", command)
-    monkeypatch.setattr(making, "POLL_SECONDS", 0.1)
+    monkeypatch.setattr(engines, "start_run", start)
+    monkeypatch.setattr(engines, "POLL_SECONDS", 0.1)
     with pytest.raises(Interrupted, match="the same command goes on"):
         reproduce.main(flags)
     assert len(started) == 2
     assert not (tmp_path / "out").exists()
-    with pytest.raises(UserError, match="1 runs failed, the first is letter-ours-paper-set2-no-shield-seed0"):
+    with pytest.raises(SystemExit, match="1 runs failed, the first is letter-ours-paper-set2-no-shield-seed0"):
         reproduce.main(flags)
     runs = PANELS["letter-techniques"].runs(1, None)
     kept = read_records(runs, tmp_path / "out")

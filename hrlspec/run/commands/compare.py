@@ -28,7 +28,7 @@ from hrlspec.run.tables import cell, plain_table
 Group = Sequence[FoundRun]
 """Runs that differ in nothing but the seed."""
 
-_SCORES = {
+SCORES = {
     "success_rate": ("success", "suite"),
     "return_mean": ("return", "suite"),
     "steps_mean": ("steps", "suite"),
@@ -134,7 +134,7 @@ def scores_of(run: FoundRun) -> dict[str, Interval]:
     nothing = Interval(math.nan, math.nan, math.nan)
     return {
         name: interval_from_json(name, found) if (found := final.get(part)) else nothing
-        for name, (_, part) in _SCORES.items()
+        for name, (_, part) in SCORES.items()
     }
 
 
@@ -142,7 +142,7 @@ def means_of(group: Group) -> dict[str, Interval] | None:
     """Means over seeds with Student's t intervals; ``None`` unless there are several and all have final results."""
     if len(group) == 1 or any(run.summary is None for run in group):
         return None
-    estimates = {name: [scores_of(run)[name].estimate for run in group] for name in _SCORES}
+    estimates = {name: [scores_of(run)[name].estimate for run in group] for name in SCORES}
     return {
         name: Interval(math.nan, math.nan, math.nan) if any(map(math.isnan, some)) else mean_interval(some)
         for name, some in estimates.items()
@@ -158,7 +158,7 @@ def _facts(run: FoundRun) -> dict[str, Any]:
 def _results(groups: Sequence[Group]) -> Table:
     table = plain_table(
         "Final results",
-        ["run", "trained", *(title.replace(" ", "\n") for title, _ in _SCORES.values())],
+        ["run", "trained", *(title.replace(" ", "\n") for title, _ in SCORES.values())],
         "95 % intervals as recorded with each run; of means over seeds Student's t; steps of successful episodes",
     )
     _let_fold(table.columns[0])
@@ -203,14 +203,14 @@ def _to_json(groups: Sequence[Group]) -> dict[str, Any]:
         "groups": [
             {
                 "label": label_of(group),
-                "mean": None if (means := means_of(group)) is None else _plain(means),
+                "mean": None if (means := means_of(group)) is None else scores_to_json(means),
                 "runs": [
                     {
                         "run": str(run.path),
                         "seed": run.settings["seed"],
                         "state": run.state,
                         "env_steps": run.env_steps,
-                        "final": None if run.summary is None else _plain(scores_of(run)),
+                        "final": None if run.summary is None else scores_to_json(scores_of(run)),
                     }
                     for run in group
                 ],
@@ -221,5 +221,6 @@ def _to_json(groups: Sequence[Group]) -> dict[str, Any]:
     }
 
 
-def _plain(scores: Mapping[str, Interval]) -> dict[str, Any]:
+def scores_to_json(scores: Mapping[str, Interval]) -> dict[str, Any]:
+    """Estimates and bounds by name, ``None`` where there are none."""
     return {key: value for name, score in scores.items() for key, value in interval_to_json(name, score).items()}

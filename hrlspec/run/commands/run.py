@@ -50,10 +50,8 @@ def main(argv: Sequence[str], *, program: str = "hrlspec run") -> None:
     """
     flags = parse_run(argv, program=program)
     runs = experiments_of(flags)
-    if flags.wandb is not None:
-        check_wandb()
+    given = check_beginning(flags, runs[0][0])
     resumed = _check_folders(runs, flags)
-    given = None if flags.from_ is None else _file_that_fits(flags.from_, runs[0][0])
     devices = _devices(flags, runs[0][0].config.blocks)
     params = None if given is None else load_file(given)
     console = result_console()
@@ -65,6 +63,37 @@ def main(argv: Sequence[str], *, program: str = "hrlspec run") -> None:
         results = [SuiteResult.from_json(summary["final"]["suite"]) for summary in summaries]
         name = runs[0][0].name.rpartition("-")[0]
         console.print(aggregate_table(f"{name}, seeds {flags.seed} to {runs[-1][0].seed}", aggregate(results)))
+
+
+def check_beginning(flags: RunFlags, experiment: Experiment) -> AgentFile | None:
+    """Refuses what a run could not begin with, as far as that shows before JAX is used.
+
+    Returns:
+        The agent that training begins from, if one is named.
+
+    Raises:
+        UserError: a library is missing, devices do not share the blocks, or the agent does not fit.
+        AgentFileError: the agent cannot be used.
+    """
+    if flags.wandb is not None:
+        check_wandb()
+    blocks = experiment.config.blocks
+    if flags.devices != "auto" and blocks % flags.devices:
+        raise UserError(f"--devices is {flags.devices}, expected a divisor of {blocks}, the number of --config.blocks")
+    return None if flags.from_ is None else _file_that_fits(flags.from_, experiment)
+
+
+def check_folder(experiment: Experiment, folder: Path, flags: RunFlags) -> bool:
+    """Whether a run that is to be made, or resumed where it was begun, is finished.
+
+    Raises:
+        UserError: it could be neither made nor resumed.
+    """
+    if not holds_run(folder):
+        check_place(folder, resume=False)
+        return False
+    _check_resumable(experiment, folder, flags)
+    return _results(experiment, folder) is not None
 
 
 def _file_that_fits(name: str, experiment: Experiment) -> AgentFile:
@@ -84,8 +113,6 @@ def _devices(flags: RunFlags, blocks: int) -> int:
     """Prepares JAX and says how many devices a run is spread over."""
     automatic = flags.devices == "auto"
     wanted = most_devices(blocks, platform.num_cores()) if automatic else int(flags.devices)
-    if blocks % wanted:
-        raise UserError(f"--devices is {wanted}, expected a divisor of {blocks}, the number of --config.blocks")
     platform.prepare(host_devices=wanted)
     available = jax.device_count()
     if automatic:
