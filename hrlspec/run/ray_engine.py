@@ -11,6 +11,7 @@ import dataclasses
 import logging
 import os
 import signal
+import socket
 import subprocess
 import time
 from collections.abc import Mapping
@@ -31,6 +32,7 @@ _HANDED_ON = ("JAX_", "XLA_", "PYTHONPATH")
 """Beginnings of the environment variables that runs get from here, not from where their node was started."""
 _STORE_BYTES = 100 * 2**20  # near the least that Ray allows; nothing of size is sent
 _MEMORY = 0.9  # of its part of a GPU that a run takes for itself
+_ANSWER = 10.0  # seconds for a cluster to answer
 _PATIENCE = 120.0  # seconds for the process before to let go of a folder
 
 
@@ -49,6 +51,7 @@ class RayEngine:
         self._running: dict[ray.ObjectRef[int], PlannedRun] = {}
 
     def __enter__(self) -> Self:
+        _check_address(self._address)
         before = signal.getsignal(signal.SIGTERM)
         how: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
         if self._address == "local":
@@ -96,6 +99,22 @@ class RayEngine:
             most = ", ".join(f"{node.get('CPU', 0):g} cores and {node.get('GPU', 0):g} GPUs" for node in nodes)
             wanted = f"{self._cores} cores and {self._gpus:g} GPUs"
             raise UserError(f"--ray {self._address}: a run is to have {wanted}, but nodes have {most}")
+
+
+def _check_address(address: str) -> None:
+    """Refuses an address where nobody answers, on which Ray would try for minutes.
+
+    Raises:
+        UserError: nobody does.
+    """
+    if address in ("auto", "local"):
+        return
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host, int(port)), timeout=_ANSWER).close()
+    except (OSError, ValueError, OverflowError) as error:
+        expected = "expected auto, local, or HOST:PORT as ray start says it"
+        raise UserError(f"--ray {address}: there is no such cluster, {expected} ({in_words(error)})") from error
 
 
 def _of_gpus(gpus: float, given: Mapping[str, str]) -> dict[str, str]:
