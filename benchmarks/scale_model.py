@@ -40,7 +40,7 @@ from hrlspec.run.platform import prepare
 
 WARMUP = 30
 """Iterations before any is timed: episodes of an untrained agent are longer."""
-ROWS = (1, 1_000, 10_000, 100_000, 1_000_000)
+ROWS = (1, 1_000, 10_000, 50_000, 200_000)
 """Lengths of the rows that are summed, float32."""
 GATHERS = 20
 """Sums in one program, so that its start counts for little."""

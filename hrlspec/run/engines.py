@@ -16,7 +16,7 @@ from hrlspec.run.console import PlainConsole
 from hrlspec.run.errors import Interrupted
 from hrlspec.run.extras import check_ray
 from hrlspec.run.places import Place, places
-from hrlspec.run.planned import PlannedRun, problem, start_run
+from hrlspec.run.planned import PlannedRun, problem_of, start_run
 from hrlspec.run.run_table import RunTable
 from hrlspec.run.signals import polled_signals
 
@@ -159,7 +159,7 @@ class LocalEngine:
         for run in done:
             self._free.append(self._running.pop(run)[1])
         self._fill()
-        return [(run, problem(code)) for run, code in done.items()]
+        return [(run, problem_of(code)) for run, code in done.items()]
 
     def _fill(self) -> None:
         while self._waiting and self._free:

@@ -59,6 +59,6 @@ def start_run(run: PlannedRun, place: Place, cwd: Path | None = None) -> subproc
         return place.start(tethered(command), stdout=log, stderr=log, cwd=cwd, start_new_session=True)
 
 
-def problem(status: int) -> str | None:
+def problem_of(status: int) -> str | None:
     """What is said of a process's exit status; nothing of 0."""
     return f"status {status}" if status else None

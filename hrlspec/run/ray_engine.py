@@ -23,7 +23,7 @@ import ray
 from hrlspec.run.errors import UserError, in_words
 from hrlspec.run.folder import is_being_written
 from hrlspec.run.places import Place, held_cores
-from hrlspec.run.planned import PlannedRun, problem, start_run
+from hrlspec.run.planned import PlannedRun, problem_of, start_run
 from hrlspec.run.platform import num_cores
 
 RETRIES = 10
@@ -128,7 +128,7 @@ def _of_gpus(gpus: float, given: Mapping[str, str]) -> dict[str, str]:
 def _problem(reference: ray.ObjectRef[int]) -> str | None:
     """What is said of a task that has ended."""
     try:
-        return problem(ray.get(reference))
+        return problem_of(ray.get(reference))
     except ray.exceptions.RayError as error:
         return in_words(error)
 
