@@ -217,6 +217,7 @@ def test_the_report_tells_the_trials(tmp_path: Path) -> None:
         ("--seeds 0", "--seeds is 0"),
         ("--steps -1", "--steps is -1"),
         ("--jobs 0", "--jobs is 0"),
+        ("--gpus-per-run 0.5", "--gpus-per-run is 0.5, expected to stand beside --ray"),
         ("--recipes secret", "there is no such recipe"),
         ("--nonsense", "Unrecognized options: --nonsense"),
     ],
