@@ -1,10 +1,12 @@
-"""The pages of docs/: marked code runs, names and settings exist, links lead somewhere, verdicts are the records'."""
+"""The pages of docs/ and the README: marked code runs, names and settings exist, links lead somewhere."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
 import importlib
+import json
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,18 @@ import pytest
 from hrlspec.presets.recipes import recipe
 
 DOCS = Path(__file__).parents[1] / "docs"
+NOTEBOOK = "quickstart.ipynb"
+"""Runs in tests/test_quickstart.py."""
+
+
+def _prose(notebook: str) -> str:
+    """What stands between its code."""
+    cells = json.loads(notebook)["cells"]
+    return "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
+
+
 PAGES = {str(page.relative_to(DOCS)): page.read_text(encoding="utf-8") for page in sorted(DOCS.rglob("*.md"))}
+PAGES[NOTEBOOK] = _prose((DOCS / NOTEBOOK).read_text(encoding="utf-8"))
 MARK = re.compile(r"^<!-- test: runs(?:, with (?P<changes>[^>]*?))? -->$", re.MULTILINE)
 """What a page says of its code: all of its Python runs, in order, with some numbers made smaller."""
 
@@ -86,11 +99,23 @@ def test_settings_exist(name: str) -> None:
     functools.reduce(getattr, name.split("."), recipe("hrlspec"))
 
 
-@pytest.mark.parametrize("page", PAGES)
+LINKED = {**PAGES, "../README.md": (DOCS.parent / "README.md").read_text(encoding="utf-8")}
+
+
+def _anchors(text: str) -> set[str]:
+    """Those of its headings, as GitHub and the site make them."""
+    headings = re.findall(r"^#+ (.*)$", re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL), re.MULTILINE)
+    return {re.sub(r"[^\w-]", "", heading.strip().lower().replace(" ", "-")) for heading in headings}
+
+
+@pytest.mark.parametrize("page", LINKED)
 def test_links_lead_somewhere(page: str) -> None:
-    for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", PAGES[page]):
+    for target, anchor in re.findall(r"\]\(([^)#\s]*)(?:#([^)]*))?\)", LINKED[page]):
         if not re.match(r"\w+:", target):
-            assert (DOCS / page).parent.joinpath(target).exists(), target
+            found = (DOCS / page).parent.joinpath(target).resolve() if target else (DOCS / page).resolve()
+            assert found.exists(), target
+            name = os.path.relpath(found, DOCS)
+            assert not anchor or anchor in _anchors(LINKED[name]), f"{target}#{anchor}"
 
 
 def test_decisions_fit_on_three_pages() -> None:

@@ -48,3 +48,9 @@ def test_the_version_is_in_the_changelog() -> None:
     changelog = (ROOT / "CHANGELOG.md").read_text()
     assert re.fullmatch(r"\d+\.\d+\.\d+", hrlspec.version.__version__)
     assert "## Unreleased" in changelog or f"## {hrlspec.version.__version__}" in changelog
+
+
+def test_the_citation_is_of_this_version() -> None:
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert re.findall(r"^version: (.*)$", citation, re.MULTILINE) == [hrlspec.version.__version__]
+    assert "](CITATION.cff)" in (ROOT / "README.md").read_text()
