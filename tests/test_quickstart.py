@@ -1,6 +1,7 @@
 """docs/quickstart.ipynb, the notebook: what is kept in it is what running it shows.
 
-Run anew and kept with ``jupyter execute --inplace docs/quickstart.ipynb``.
+Kept anew, with the extra ``docs``, by ``jupyter nbconvert --to notebook --execute --inplace
+--ExecutePreprocessor.record_timing=False docs/quickstart.ipynb``.
 """
 
 from __future__ import annotations
@@ -61,8 +62,7 @@ def test_running_it_shows_what_is_kept(tmp_path: Path, monkeypatch: pytest.Monke
     for variable in ("IPYTHONDIR", "JUPYTER_RUNTIME_DIR"):
         monkeypatch.setenv(variable, str(tmp_path / variable))
     notebook = kept()
-    training = [cell for cell in code(notebook) if "total_steps" in cell.source]
-    (cell,) = training
+    (cell,) = (cell for cell in code(notebook) if "total_steps" in cell.source)
     cell.source, count = re.subn(r'"total_steps": [\d_]+', '"total_steps": 8_192', cell.source)
     assert count == 1
     NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
