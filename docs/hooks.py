@@ -30,7 +30,7 @@ def on_files(files: Files, config: Any) -> Files:
     notebook = files.get_file_from_path(NOTEBOOK)
     files.remove(notebook)
     exporter = MarkdownExporter(extra_loaders=[DictLoader({"page.md.j2": TEMPLATE})], template_file="page.md.j2")
-    text, resources = exporter.from_filename(notebook.abs_src_path)
+    text, resources = exporter.from_filename(notebook.abs_src_path, {"output_files_dir": "quickstart"})
     for name, content in {PAGE: text, **resources["outputs"]}.items():
         files.append(File.generated(config, name, content=content))
     for figure in sorted((ROOT / FIGURES).iterdir()):
