@@ -103,9 +103,10 @@ def as_target(leaf: Leaf, like: Any) -> Any:
     if isinstance(like, np.ndarray | np.generic):
         return leaf.value[()] if isinstance(like, np.generic) else leaf.value
     array = jnp.array(leaf.value)  # a copy, since JAX may be asked to donate it
-    if leaf.kind.kind == "key":
-        array = jax.random.wrap_key_data(array, impl=leaf.implementation)
-    return jax.device_put(array, like.sharding) if isinstance(like, jax.Array) and like.committed else array
+    if isinstance(like, jax.Array) and like.committed:
+        # Of what lies on other processes' devices each process places its own share.
+        array = jax.make_array_from_callback(array.shape, like.sharding, array.__getitem__)
+    return jax.random.wrap_key_data(array, impl=leaf.implementation) if leaf.kind.kind == "key" else array
 
 
 def is_extended(dtype: np.dtype) -> bool:

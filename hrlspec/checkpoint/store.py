@@ -12,7 +12,8 @@ numbers. A checkpoint is a folder::
 
 It is written under a temporary name, flushed to the disk, read back and renamed, so a folder of that name is always
 complete, and older ones are deleted only then.
-One process writes; several processes that save into the same folder at once are out of scope.
+One process writes; several processes that save into the same folder at once are out of scope. Where several train
+together, one of them saves a state that it can read all of, and each loads what belongs on its devices.
 """
 
 from __future__ import annotations
@@ -420,9 +421,15 @@ def _orbax(folder: Path) -> Iterator[tuple[Any, Any, Path]]:
     level = logger.level
     logger.setLevel(logging.CRITICAL)  # orbax logs through absl, to the terminal
     try:
+        here = jax.process_index()  # or orbax would wait for the others
+        alone = ocp.options.MultiprocessingOptions(
+            primary_host=here, active_processes={here}, barrier_sync_key_prefix=f"hrlspec-{here}"
+        )
         with (
             _plainly_named(folder.absolute()) as plain,
-            ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as checkpointer,
+            ocp.Checkpointer(
+                ocp.PyTreeCheckpointHandler(multiprocessing_options=alone), multiprocessing_options=alone
+            ) as checkpointer,
         ):
             yield ocp, checkpointer, plain / _ARRAYS
     finally:

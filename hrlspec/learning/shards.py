@@ -37,6 +37,19 @@ def most_devices(blocks: int, available: int) -> int:
     return max(devices for devices in range(1, min(blocks, available) + 1) if blocks % devices == 0)
 
 
+def num_devices() -> int:
+    """How many devices there are, as many of each process."""
+    return jax.process_count() * min(len(jax.local_devices(index)) for index in range(jax.process_count()))
+
+
+def first_devices(number: int) -> list[jax.Device]:
+    """So many devices, the first ones of each process, and as many of each; a single one is this process's own."""
+    if number == 1:
+        return jax.local_devices()[:1]
+    each, processes = number // jax.process_count(), range(jax.process_count())
+    return [device for index in processes for device in jax.local_devices(index)[:each]]
+
+
 @dataclasses.dataclass(frozen=True)
 class Shards:
     """E environments in G blocks on D devices. Static.
@@ -44,10 +57,11 @@ class Shards:
     Attributes:
         num_envs: E.
         blocks: G.
-        devices: D, the first ones that JAX has.
+        devices: D, of all processes together: the first ones that JAX has, as many of each process.
 
     Raises:
-        ConfigError: the devices do not share the blocks evenly, or there are not as many.
+        ConfigError: the devices do not share the blocks evenly, or there are not as many, or not as many of each
+            process.
     """
 
     num_envs: int
@@ -57,13 +71,17 @@ class Shards:
     def __post_init__(self) -> None:
         if self.devices < 1 or self.blocks % self.devices:
             raise ConfigError(f"devices is {self.devices}, expected a divisor of {self.blocks}, the number of blocks")
-        if self.devices > jax.device_count():
-            raise ConfigError(f"devices is {self.devices}, but JAX has {jax.device_count()}")
+        if self.devices > num_devices():
+            raise ConfigError(f"devices is {self.devices}, but JAX has {num_devices()}")
+        if self.devices > 1 and self.devices % jax.process_count():
+            raise ConfigError(
+                f"devices is {self.devices}, expected a multiple of {jax.process_count()}, the number of processes"
+            )
 
     @functools.cached_property
     def mesh(self) -> Mesh:
-        """The devices in a row."""
-        return Mesh(np.array(jax.devices()[: self.devices]), (_AXIS,))
+        """The devices in a row, process by process."""
+        return Mesh(np.array(first_devices(self.devices)), (_AXIS,))
 
     def placed(self, tree: T, places: T) -> T:
         """Arrays of a traced program, laid over the devices as the partition specs in ``places`` say."""

@@ -12,11 +12,13 @@ from typing import NoReturn
 
 from hrlspec.run.checkout import check_checkout
 from hrlspec.run.errors import UserError, main_guard
+from hrlspec.run.heartbeat import answer_supervisor
 from hrlspec.run.signals import leave
 from hrlspec.version import __version__
 
 COMMANDS = {
     "run": "train an agent, evaluate it on unseen tasks, draw what it does",
+    "launch": "the same with several processes of this machine, kept going",
     "evaluate": "evaluate a trained agent on tasks of your own, or draw it",
     "replay": "a page that plays episodes of trained agents, with what they thought",
     "play": "a page, served on this machine, where you type a task and watch an agent carry it out",
@@ -55,7 +57,12 @@ def call(name: str, argv: Sequence[str] | None = None, *, program: str) -> int:
         argv: the command's arguments, those of the process by default.
         program: what the user called, for messages.
     """
-    return main_guard(lambda: _command(name)(sys.argv[1:] if argv is None else argv, program=program))
+
+    def command() -> None:
+        answer_supervisor()
+        _command(name)(sys.argv[1:] if argv is None else argv, program=program)
+
+    return main_guard(command)
 
 
 def _help() -> str:

@@ -201,6 +201,14 @@ def open_run(
         yield run
 
 
+@contextlib.contextmanager
+def followed_run(path: Path, config: Any, *, resume: bool) -> Iterator[RunFolder]:
+    """The folder of a run that another process has open, to read from."""
+    resolved = plain(config)
+    with contextlib.ExitStack() as stack:
+        yield RunFolder(path, resolved, config_hash(resolved), frozenset(), resume, False, None, stack)
+
+
 def check_place(folder: Path, *, resume: bool) -> None:
     """Refuses what `open_run` would refuse, as far as that shows before anything is made in or beside the folder.
 

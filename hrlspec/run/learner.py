@@ -106,7 +106,7 @@ class Learner:
             iterate=self._iterate,
             evaluate=self._evaluate,
             summarise=self._summarise,
-            healthy=lambda state: bool(_all_finite(state.params)),
+            healthy=lambda state: bool(_all_finite(on_one_device(state.params))),
             steps_per_iteration=self.experiment.config.steps_per_iteration,
             num_iterations=self.experiment.config.num_iterations,
             evaluate_every=self.experiment.evaluation.every,

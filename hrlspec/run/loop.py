@@ -16,8 +16,10 @@ from typing import Any, Protocol
 import jax
 
 from hrlspec import checkpoint
+from hrlspec.run import heartbeat
 from hrlspec.run.errors import Interrupted
 from hrlspec.run.folder import RunFolder
+from hrlspec.run.hosts import ALONE, Hosts
 from hrlspec.run.signals import StopRequest, polled_signals
 
 Row = dict[str, Any]
@@ -103,10 +105,13 @@ class Loop:
         folder: where rows and checkpoints go.
         display: who is told.
         checkpoint_seconds: how much work a kill may cost; there is always a checkpoint at the end.
+        hosts: which of the processes this is that drive the job together, each its own loop.
     """
 
-    def __init__(self, job: Job, folder: RunFolder, display: Display, *, checkpoint_seconds: float) -> None:
-        self._job, self._folder, self._display = job, folder, display
+    def __init__(
+        self, job: Job, folder: RunFolder, display: Display, *, checkpoint_seconds: float, hosts: Hosts = ALONE
+    ) -> None:
+        self._job, self._folder, self._display, self._hosts = job, folder, display, hosts
         self._checkpoint_seconds = checkpoint_seconds
         self._at = Position()
         self._skipping = 0
@@ -126,15 +131,21 @@ class Loop:
         state = self._job.init()
         if not self._folder.resumed:
             return state
-        try:
-            restored = checkpoint.load(self._folder.checkpoints, state)
-        except checkpoint.CheckpointMissingError:
-            self._folder.rewind(-1)
+        found: list[checkpoint.Restored[State]] = []
+
+        def newest() -> int | None:
+            with contextlib.suppress(checkpoint.CheckpointMissingError):
+                found.append(checkpoint.load(self._folder.checkpoints, state))
+                if found[0].metadata["config_hash"] not in {self._folder.config_hash, *self._folder.earlier_hashes}:
+                    raise checkpoint.CheckpointMismatchError(f"checkpoint {found[0].path} belongs to another run")
+            self._folder.rewind(found[0].step if found else -1)
+            return found[0].step if found else None
+
+        step = self._hosts.lead(newest)
+        if step is None:
             return state
-        if restored.metadata["config_hash"] not in {self._folder.config_hash, *self._folder.earlier_hashes}:
-            raise checkpoint.CheckpointMismatchError(f"checkpoint {restored.path} belongs to another run")
+        restored = found[0] if found else checkpoint.load(self._folder.checkpoints, state, step=step)
         self._at = Position(**restored.metadata["position"])
-        self._folder.rewind(restored.step)
         return restored.state
 
     def train(self, state: State) -> State:
@@ -153,7 +164,12 @@ class Loop:
         job, at = self._job, self._at
         earlier, started = at.wall, time.monotonic()
         saved = mark = started
-        first = at.done
+        first, stopping = at.done, False
+
+        def asked() -> tuple[bool, bool]:
+            """Whether to stop, and whether to save."""
+            return self._hosts.any(bool(stop)), time.monotonic() - saved >= self._checkpoint_seconds
+
         while at.done < job.num_iterations:
             state, metrics = job.iterate(state, at.done)
             stop.patient = True
@@ -164,28 +180,33 @@ class Loop:
                 mark = time.monotonic()
             else:
                 at.timed += 1
-            evaluating, saving = job.evaluation_due(at.done), time.monotonic() - saved >= self._checkpoint_seconds
-            pause = evaluating or saving or bool(stop)
+            evaluating, (stopping, saving) = job.evaluation_due(at.done), self._hosts.lead(asked)
+            pause = evaluating or saving or stopping
             self._collect(leave=0 if pause else 1)
             if not pause:
                 continue
+            heartbeat.note(steady=False)
             at.training += time.monotonic() - mark
             at.wall = earlier + time.monotonic() - started
             if evaluating:
                 self._evaluate(state)
                 at.wall = earlier + time.monotonic() - started
-            if saving or stop or at.done == job.num_iterations:
+                stopping = self._hosts.lead(asked)[0]
+            if saving or stopping or at.done == job.num_iterations:
                 self._save(state)
                 saved = time.monotonic()
-            if stop and at.done < job.num_iterations:
+                stopping = self._hosts.lead(asked)[0]
+            if stopping and at.done < job.num_iterations:
                 raise Interrupted(
-                    f"{stop.signal_name} after {self._env_steps} of {job.num_iterations * job.steps_per_iteration} "
+                    f"{stop.signal_name or 'a signal'} after {self._env_steps} of "
+                    f"{job.num_iterations * job.steps_per_iteration} "
                     f"environment steps; a checkpoint is in {self._folder.path}, --resume continues from it"
                 )
             mark = time.monotonic()
-        if stop:
+        if stopping:
             raise Interrupted(
-                f"{stop.signal_name} after the last step; --resume evaluates what is in {self._folder.path}"
+                f"{stop.signal_name or 'a signal'} after the last step; "
+                f"--resume evaluates what is in {self._folder.path}"
             )
         return state
 
@@ -204,6 +225,7 @@ class Loop:
             skipped = any(value > 0 for name, value in metrics.items() if name.endswith("skipped"))
             self._skipping = self._skipping + 1 if skipped else 0
             env_steps = (at.done - len(self._pending)) * self._job.steps_per_iteration
+            heartbeat.note(steady=True)
             self._display.advance(env_steps, metrics)
             if self._skipping >= PATIENCE:
                 raise DivergedError(
@@ -213,8 +235,13 @@ class Loop:
 
     def _evaluate(self, state: State) -> None:
         """Adds a row."""
-        at, job = self._at, self._job
         self._check(state)
+        self._hosts.lead(lambda: self._add_row(state))
+        at = self._at
+        at.iterations, at.sums, at.timed, at.training = 0, {}, 0, 0.0
+
+    def _add_row(self, state: State) -> None:
+        at, job = self._at, self._job
         row = {
             "env_steps": self._env_steps,
             "wall_s": round(at.wall, 3),
@@ -222,13 +249,16 @@ class Loop:
             **job.summarise(at.sums, at.iterations),
             "train/steps_per_s": round(at.timed * job.steps_per_iteration / at.training, 1) if at.timed else None,
         }
-        at.iterations, at.sums, at.timed, at.training = 0, {}, 0, 0.0
         with self._refusals_told():
             self._folder.append(row)
         self._display.row(row)
 
     def _save(self, state: State) -> None:
         self._check(state)  # what is damaged must not replace what is not
+        readable = self._hosts.readable(state)
+        self._hosts.lead(lambda: self._write(readable))
+
+    def _write(self, state: State) -> None:
         metadata = {"config_hash": self._folder.config_hash, "position": dataclasses.asdict(self._at)}
         with self._refusals_told():
             checkpoint.save(self._folder.checkpoints, self._env_steps, state, metadata=metadata)

@@ -148,9 +148,9 @@ def _is_known(name: str, value: str | bool) -> bool:
     return True
 
 
-def num_cores() -> int:
-    """Cores of the processor that this process may use."""
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+def cores() -> list[int]:
+    """The numbers of the processor's cores that this process may use."""
+    return sorted(os.sched_getaffinity(0)) if sys.platform == "linux" else list(range(os.cpu_count() or 1))
 
 
 def cache_folder() -> Path | None:

@@ -28,6 +28,7 @@ from jax.experimental.compilation_cache import compilation_cache
 import envs_jax
 import hrlspec
 from hrlspec.config import Effort
+from hrlspec.learning.shards import first_devices
 from hrlspec.run.platform import compiler_options
 
 KEPT = 64
@@ -47,7 +48,7 @@ class Program:
         static: these; their ``repr`` must tell everything about them.
         effort: of the compiler; see `compiler_options`.
         kept: from one process to the next, if JAX's own cache is in use.
-        devices: on how many of JAX's devices it runs, the first ones.
+        devices: on how many it runs; see `first_devices`.
     """
 
     def __init__(
@@ -137,7 +138,7 @@ def _load(file: Path, args: tuple[Any, ...], devices: int) -> Callable[..., Any]
     os.utime(file)
     in_tree = jax.tree.structure((args, {}))
     program: Any = serialize_executable.deserialize_and_load(
-        payload, in_tree, jax.tree.structure(result), execution_devices=jax.devices()[:devices]
+        payload, in_tree, jax.tree.structure(result), execution_devices=first_devices(devices)
     )
     return program
 
@@ -185,6 +186,7 @@ def _fingerprint() -> tuple[Any, ...]:
         os.environ.get("XLA_FLAGS"),
         platform.python_version(),
         (device.platform, device.device_kind, jax.device_count(), _processor()),
+        (jax.process_index(), jax.process_count()),
     )
 
 

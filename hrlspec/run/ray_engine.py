@@ -24,7 +24,7 @@ from hrlspec.run.errors import UserError, in_words
 from hrlspec.run.folder import is_being_written
 from hrlspec.run.places import Place, held_cores
 from hrlspec.run.planned import PlannedRun, problem_of, start_run
-from hrlspec.run.platform import num_cores
+from hrlspec.run import platform
 
 RETRIES = 10
 """Nodes that a run may lose."""
@@ -55,7 +55,7 @@ class RayEngine:
         before = signal.getsignal(signal.SIGTERM)
         how: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
         if self._address == "local":
-            how |= {"num_cpus": num_cores(), "object_store_memory": _STORE_BYTES, "include_dashboard": False}
+            how |= {"num_cpus": len(platform.cores()), "object_store_memory": _STORE_BYTES, "include_dashboard": False}
         try:
             ray.init(self._address, **how)
         except Exception as error:  # as many kinds as there are reasons

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import re
 import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from hrlspec.presets import KNOWN, PRESETS, Recipe, RewardSet
 from hrlspec.run.errors import UserError
 from hrlspec.run.experiment import EvaluationConfig, Experiment
 from hrlspec.run.flags import flag_of, in_flags, parse_flags, settings_in
+from hrlspec.run.hosts import AUTO
 from hrlspec.run.lookup import method_named, preset_named
 from hrlspec.run.trained import find_file
 
@@ -56,7 +58,14 @@ class RunFlags(Checked):
     make a run longer, finished or not."""
     devices: int | Literal["auto"] = setting("auto", least=1)
     """Devices to spread the environments over, a divisor of --config.blocks; those of a processor are its cores. auto:
-    as many as there are. Results do not depend on it."""
+    as many as there are. Several processes share them. Results do not depend on it."""
+    distributed: str | None = None
+    """Several processes train one run together. auto: as SLURM, Open MPI or Kubernetes has started them; elsewhere
+    HOST:PORT, where the first one listens, with --num-processes and --process-id. See also hrlspec launch."""
+    num_processes: int | None = setting(None, least=1)
+    """How many they are."""
+    process_id: int | None = setting(None, least=0)
+    """Which one this is, from 0."""
     checkpoint_minutes: float = setting(1.0, least=0, most=1e6)
     """How much work a kill may cost."""
     wandb: str | None = None
@@ -81,6 +90,25 @@ class RunFlags(Checked):
         if self.seed + self.num_seeds - 1 > LAST_SEED:
             raise ConfigError(
                 f"RunFlags.num_seeds is {self.num_seeds}, expected the last seed to be at most {LAST_SEED}"
+            )
+        self._check_processes()
+
+    def _check_processes(self) -> None:
+        given = self.num_processes, self.process_id
+        if self.distributed in (None, AUTO):
+            if given != (None, None):
+                name, value = ("num_processes", given[0]) if given[0] is not None else ("process_id", given[1])
+                raise ConfigError(f"RunFlags.{name} is {value}, expected --distributed HOST:PORT with it")
+        elif not re.fullmatch(r"\S+:\d{1,5}", self.distributed):
+            raise ConfigError(f"RunFlags.distributed is {self.distributed!r}, expected {AUTO} or HOST:PORT")
+        elif self.num_processes is None or self.process_id is None:
+            raise ConfigError(
+                f"RunFlags.distributed is {self.distributed}, expected --num-processes and --process-id with it"
+            )
+        elif self.process_id >= self.num_processes:
+            raise ConfigError(
+                f"RunFlags.process_id is {self.process_id}, expected less than {self.num_processes}, the number of "
+                "processes"
             )
 
 

@@ -22,6 +22,10 @@ INTERRUPTED = 130
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _PATIENCE = 1.0  # seconds
 
+Hear = Callable[[str], None]
+_hearers: list[Hear] = []  # of the contexts that last, the innermost last
+_elsewhere: Hear | None = None
+
 
 class StopRequest:
     """Whether somebody asked the process to stop.
@@ -86,8 +90,20 @@ def polled_signals(how_to_go_on: str = "") -> Iterator[StopRequest]:
         yield stop
 
 
+def redirect(to: Hear) -> None:
+    """From now on a function is told of this process's signals instead; what it decides comes by `deliver`."""
+    global _elsewhere  # noqa: PLW0603
+    _elsewhere = to
+
+
+def deliver(name: str) -> None:
+    """As if this process had got a signal, in any thread."""
+    for hear in _hearers[-1:]:
+        hear(name)
+
+
 @contextlib.contextmanager
-def _heard(hear: Callable[[str], None]) -> Iterator[None]:
+def _heard(hear: Hear) -> Iterator[None]:
     """Calls a function with the name of each signal, in a thread; the main thread goes on when it has returned."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -99,7 +115,7 @@ def _heard(hear: Callable[[str], None]) -> Iterator[None]:
     def listen() -> None:
         while number := ours.recv(1):
             if number[0] in SIGNALS:
-                hear(signal.Signals(number[0]).name)
+                (_elsewhere or hear)(signal.Signals(number[0]).name)
                 heard.release()
 
     def wait(number: int, frame: FrameType | None) -> None:
@@ -111,9 +127,11 @@ def _heard(hear: Callable[[str], None]) -> Iterator[None]:
         listener.start()
         woken = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
         before = {number: signal.signal(number, wait) for number in SIGNALS}
+        _hearers.append(hear)
         try:
             yield
         finally:
+            _hearers.remove(hear)
             for number, handler in before.items():
                 signal.signal(number, handler)
             signal.set_wakeup_fd(woken)

@@ -16,14 +16,24 @@ import jax
 from hrlspec.agent.low_level import Params
 from hrlspec.agent_files import AgentFile
 from hrlspec.evaluation import SuiteResult, aggregate
-from hrlspec.learning.shards import most_devices
+from hrlspec.learning.shards import most_devices, num_devices
 from hrlspec.run import platform
 from hrlspec.run.configuration import differences
 from hrlspec.run.console import PlainConsole, result_console
 from hrlspec.run.errors import UserError
 from hrlspec.run.experiment import Experiment, experiment_of
 from hrlspec.run.extras import check_wandb, drawing
-from hrlspec.run.folder import RunFolder, check_place, check_same, holds_run, open_run, read_record, read_summary
+from hrlspec.run.folder import (
+    RunFolder,
+    check_place,
+    check_same,
+    followed_run,
+    holds_run,
+    open_run,
+    read_record,
+    read_summary,
+)
+from hrlspec.run.hosts import Hosts, joined
 from hrlspec.run.learner import Learner, on_one_device
 from hrlspec.run.live_curves import CURVES, LiveCurves, draw_curves
 from hrlspec.run.loop import DivergedError, Loop, UnsavedError
@@ -51,12 +61,20 @@ def main(argv: Sequence[str], *, program: str = "hrlspec run") -> None:
     flags = parse_run(argv, program=program)
     runs = experiments_of(flags)
     given = check_beginning(flags, runs[0][0])
-    resumed = _check_folders(runs, flags)
-    devices = _devices(flags, runs[0][0].config.blocks)
+    with joined(flags.distributed, flags.num_processes, flags.process_id) as hosts:
+        _run_all(runs, given, flags, hosts)
+
+
+def _run_all(
+    runs: Sequence[tuple[Experiment, Path]], given: AgentFile | None, flags: RunFlags, hosts: Hosts
+) -> None:
+    """One run after the other, and what they have in common."""
+    resumed = hosts.lead(lambda: _check_folders(runs, flags))
+    devices = _devices(flags, runs[0][0].config.blocks, hosts)
     params = None if given is None else load_file(given)
     console = result_console()
     summaries = [
-        _run(experiment, folder, resume, devices, params, flags, console)
+        _run(experiment, folder, resume, devices, params, flags, console, hosts)
         for (experiment, folder), resume in zip(runs, resumed, strict=True)
     ]
     if len(summaries) > 1:
@@ -109,14 +127,20 @@ def _file_that_fits(name: str, experiment: Experiment) -> AgentFile:
     return file
 
 
-def _devices(flags: RunFlags, blocks: int) -> int:
-    """Prepares JAX and says how many devices a run is spread over."""
-    automatic = flags.devices == "auto"
-    wanted = most_devices(blocks, platform.num_cores()) if automatic else int(flags.devices)
-    platform.prepare(host_devices=wanted)
-    available = jax.device_count()
+def _devices(flags: RunFlags, blocks: int, hosts: Hosts) -> int:
+    """Prepares JAX and says how many devices a run is spread over, as many of each process."""
+    automatic, count = flags.devices == "auto", hosts.count
+    if blocks % count:
+        raise UserError(f"{count} processes are no divisor of {blocks}, the number of --config.blocks")
+    wanted = hosts.lead(lambda: most_devices(blocks // count, len(platform.cores())) * count)
+    if not automatic:
+        wanted = int(flags.devices)
+    if wanted % count:
+        raise UserError(f"--devices is {wanted}, expected a multiple of {count}, the number of processes")
+    platform.prepare(host_devices=wanted // count)
+    available = num_devices()
     if automatic:
-        return most_devices(blocks, available)
+        return most_devices(blocks // count, available // count) * count
     if wanted > available:
         raise UserError(f"--devices is {wanted}, but JAX has {available} ({jax.default_backend()})")
     return wanted
@@ -168,24 +192,31 @@ def _run(
     params: Params | None,
     flags: RunFlags,
     console: PlainConsole,
+    hosts: Hosts,
 ) -> dict[str, Any]:
     """One run from its beginning, or from where it was left, to its summary."""
-    summary = _results(experiment, folder) if resume else None
+    summary = hosts.lead(lambda: _results(experiment, folder) if resume else None)
     if summary is not None:
         console.say(f"{folder} is finished; its results are in summary.json")
         return summary
     before = experiment_of(read_record(folder)["config"], str(folder)) if resume else experiment
     preset = with_tasks(experiment.preset, folder, experiment.seed)
     learner = Learner(experiment, preset, devices, params)
-    with open_run(folder, experiment, resume=resume, may_change=_may_change(flags), wandb=flags.wandb) as run:
-        # Suite dag comes last: where it is there all are.
-        for name, text in sorted(preset.texts.items(), reverse=True):
-            run.write_tasks(name, text)
+    with (
+        open_run(folder, experiment, resume=resume, may_change=_may_change(flags), wandb=flags.wandb)
+        if hosts.leads
+        else followed_run(folder, experiment, resume=resume) as run
+    ):
+        if hosts.leads:
+            # Suite dag comes last: where it is there all are.
+            for name, text in sorted(preset.texts.items(), reverse=True):
+                run.write_tasks(name, text)
+        hosts.meet(learner.trainer.shards.mesh)
         job = learner.job()
         total = job.num_iterations * job.steps_per_iteration
         with ProgressDisplay(total, experiment.name) as display:
             watched = LiveCurves(display, run, experiment.name)
-            loop = Loop(job, run, watched, checkpoint_seconds=60 * flags.checkpoint_minutes)
+            loop = Loop(job, run, watched, checkpoint_seconds=60 * flags.checkpoint_minutes, hosts=hosts)
             state = loop.restore()
             if loop.position.done:
                 display.note(_continuing(experiment, before, loop.position.done))
@@ -196,7 +227,8 @@ def _run(
         wall = loop.position.wall
         console.say(f"{experiment.name}: trained in {duration(wall)}; evaluating")
         with ended_by_signals(f"during the final evaluation; training is saved in {folder}, --resume ends it"):
-            return _finish(learner, run, on_one_device(state.params), total, wall, console)
+            params = on_one_device(state.params)
+            return hosts.lead(lambda: _finish(learner, run, params, total, wall, console))
 
 
 def _continuing(experiment: Experiment, before: Experiment, done: int) -> str:
