@@ -14,6 +14,7 @@ import functools
 import itertools
 import json
 import os
+import socket
 import sys
 import traceback
 from collections.abc import Callable, Iterator
@@ -80,13 +81,15 @@ class Hosts:
             client.key_value_delete(f"hrlspec/{number - _REMEMBERED}")
         return result
 
-    def any(self, wish: bool) -> bool:
-        """Whether one of the processes has a wish, as far as the first one knows yet."""
-        if self.count == 1:
-            return wish
-        if wish:
+    def wished(self, mine: bool) -> bool:
+        """Tells the first process of a wish; there, whether any process has had it."""
+        if self.count == 1 or (self.leads and mine):
+            return mine
+        if self.leads:
+            return bool(_client().key_value_dir_get("hrlspec/wish"))
+        if mine:
             _client().key_value_set(f"hrlspec/wish/{self.index}", "", allow_overwrite=True)
-        return wish or bool(_client().key_value_dir_get("hrlspec/wish"))
+        return mine
 
     def meet(self, mesh: Mesh) -> None:
         """Waits for all processes, and connects their devices.
@@ -110,6 +113,13 @@ class Hosts:
 
 
 ALONE = Hosts()
+
+
+def local_address() -> str:
+    """An address for processes of this machine, at which nobody listens now."""
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{server.getsockname()[1]}"
 
 
 @contextlib.contextmanager
@@ -140,6 +150,8 @@ def joined(address: str | None, count: int | None = None, index: int | None = No
         yield hosts
         jax.distributed.shutdown()
     except BaseException as error:
+        if isinstance(error, UserError) and not jax.distributed.is_initialized():
+            raise
         _leave(error, stderr)
 
 
@@ -157,10 +169,12 @@ def _join(address: str, count: int | None, index: int | None) -> Hosts:
         jax.distributed.initialize(
             **options, heartbeat_timeout_seconds=_HEARTBEAT_SECONDS, shutdown_timeout_seconds=_HEARTBEAT_SECONDS
         )
-    except ValueError as error:
+    except jax.errors.JaxRuntimeError:
+        raise
+    except (RuntimeError, ValueError) as error:
         raise UserError(
-            f"--distributed {address}: no SLURM, Open MPI or Kubernetes that JAX knows has started this process "
-            f"({in_words(error)}); give HOST:PORT, --num-processes and --process-id"
+            f"--distributed {address}: {in_words(error)}; where neither SLURM nor Open MPI nor Kubernetes has started "
+            "this process, give HOST:PORT, --num-processes and --process-id"
         ) from error
     return Hosts(global_state.num_processes, global_state.process_id)
 

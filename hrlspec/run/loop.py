@@ -168,7 +168,8 @@ class Loop:
 
         def asked() -> tuple[bool, bool]:
             """Whether to stop, and whether to save."""
-            return self._hosts.any(bool(stop)), time.monotonic() - saved >= self._checkpoint_seconds
+            wished = self._hosts.wished(bool(stop))
+            return self._hosts.lead(lambda: (wished, time.monotonic() - saved >= self._checkpoint_seconds))
 
         while at.done < job.num_iterations:
             state, metrics = job.iterate(state, at.done)
@@ -180,7 +181,7 @@ class Loop:
                 mark = time.monotonic()
             else:
                 at.timed += 1
-            evaluating, (stopping, saving) = job.evaluation_due(at.done), self._hosts.lead(asked)
+            evaluating, (stopping, saving) = job.evaluation_due(at.done), asked()
             pause = evaluating or saving or stopping
             self._collect(leave=0 if pause else 1)
             if not pause:
@@ -191,11 +192,11 @@ class Loop:
             if evaluating:
                 self._evaluate(state)
                 at.wall = earlier + time.monotonic() - started
-                stopping = self._hosts.lead(asked)[0]
+                stopping = asked()[0]
             if saving or stopping or at.done == job.num_iterations:
                 self._save(state)
                 saved = time.monotonic()
-                stopping = self._hosts.lead(asked)[0]
+                stopping = asked()[0]
             if stopping and at.done < job.num_iterations:
                 raise Interrupted(
                     f"{stop.signal_name or 'a signal'} after {self._env_steps} of "

@@ -25,7 +25,8 @@ from hrlspec.run.hosts import LOST
 from hrlspec.run.platform import cores
 from hrlspec.run.signals import INTERRUPTED, StopRequest, polled_signals
 
-SILENCE_SECONDS = 10.0  # until a process counts as stopped
+# Without a sign a process counts as stopped; before it has done anything it loads libraries, which may keep it from one.
+SILENCE_SECONDS, LOADING_SECONDS = 5.0, 15.0
 STEADY_SECONDS, STEADY_TIMES = 10.0, 10.0  # how long an iteration may take at least, and in terms of the longest
 _PARTING_SECONDS = 2.0  # for the others to end by themselves, and say why
 _LONGEST_DELAY = 60.0  # seconds before another try
@@ -54,7 +55,8 @@ class Watch:
 
     def complaint(self, now: float) -> str | None:
         """What is wrong with it, if anything."""
-        if self._beat is not None and now - self._beat > SILENCE_SECONDS:
+        silence = SILENCE_SECONDS if self._count else LOADING_SECONDS
+        if self._beat is not None and now - self._beat > silence:
             return f"has not answered for {now - self._beat:.0f} s"
         limit = self._patience
         if self._steady and self._longest:

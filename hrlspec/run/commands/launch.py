@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import socket
 import sys
 from collections.abc import Sequence
 from typing import Annotated
@@ -16,6 +15,7 @@ from hrlspec.run.console import PlainConsole
 from hrlspec.run.errors import UserError
 from hrlspec.run.flags import parse_flags
 from hrlspec.run.folder import holds_run
+from hrlspec.run.hosts import local_address
 from hrlspec.run.run_flags import experiments_of, parse_run
 from hrlspec.run.supervisor import supervise
 
@@ -57,7 +57,7 @@ def main(argv: Sequence[str], *, program: str = "hrlspec launch") -> None:
         command = [sys.executable, "-m", "hrlspec.run.cli", "run", *given, *(["--resume"] if begun else [])]
         if flags.processes == 1:
             return [command]
-        together = ["--distributed", f"127.0.0.1:{_free_port()}", "--num-processes", str(flags.processes)]
+        together = ["--distributed", local_address(), "--num-processes", str(flags.processes)]
         return [[*command, *together, "--process-id", str(index)] for index in range(flags.processes)]
 
     status = supervise(
@@ -69,11 +69,3 @@ def main(argv: Sequence[str], *, program: str = "hrlspec launch") -> None:
     )
     if status:
         raise SystemExit(status)
-
-
-def _free_port() -> int:
-    """A port on which nobody listens now."""
-    with socket.socket() as server:
-        server.bind(("127.0.0.1", 0))
-        port: int = server.getsockname()[1]
-    return port

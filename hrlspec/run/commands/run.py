@@ -131,7 +131,7 @@ def _devices(flags: RunFlags, blocks: int, hosts: Hosts) -> int:
     """Prepares JAX and says how many devices a run is spread over, as many of each process."""
     automatic, count = flags.devices == "auto", hosts.count
     if blocks % count:
-        raise UserError(f"{count} processes are no divisor of {blocks}, the number of --config.blocks")
+        raise UserError(f"--config.blocks is {blocks}, expected a multiple of {count}, the number of processes")
     wanted = hosts.lead(lambda: most_devices(blocks // count, len(platform.cores())) * count)
     if not automatic:
         wanted = int(flags.devices)
