@@ -102,10 +102,14 @@ def as_target(leaf: Leaf, like: Any) -> Any:
         return leaf.value == "True" if leaf.kind.kind == "bool" else PYTHON_NUMBERS[leaf.kind.kind](leaf.value)
     if isinstance(like, np.ndarray | np.generic):
         return leaf.value[()] if isinstance(like, np.generic) else leaf.value
-    array = jnp.array(leaf.value)  # a copy, since JAX may be asked to donate it
-    if isinstance(like, jax.Array) and like.committed:
-        # Of what lies on other processes' devices each process places its own share.
-        array = jax.make_array_from_callback(array.shape, like.sharding, array.__getitem__)
+    value = leaf.value
+
+    def copy(share: Any) -> jax.Array:
+        return jnp.array(value[share])  # since JAX may be asked to donate it
+
+    # Of what lies on several processes' devices each process places its own share.
+    placed = isinstance(like, jax.Array) and like.committed
+    array = jax.make_array_from_callback(value.shape, like.sharding, copy) if placed else copy(...)
     return jax.random.wrap_key_data(array, impl=leaf.implementation) if leaf.kind.kind == "key" else array
 
 

@@ -25,7 +25,7 @@ from hrlspec.run.hosts import LOST
 from hrlspec.run.platform import cores
 from hrlspec.run.signals import INTERRUPTED, StopRequest, polled_signals
 
-# Without a sign a process counts as stopped; before it has done anything it loads libraries, which may keep it from one.
+# Until a process counts as stopped. Before it has done anything it loads libraries, which may keep it from any sign.
 SILENCE_SECONDS, LOADING_SECONDS = 5.0, 15.0
 STEADY_SECONDS, STEADY_TIMES = 10.0, 10.0  # how long an iteration may take at least, and in terms of the longest
 _PARTING_SECONDS = 2.0  # for the others to end by themselves, and say why
