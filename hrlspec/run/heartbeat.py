@@ -23,10 +23,16 @@ _PR_SET_PDEATHSIG = 1
 
 
 class _Progress:
-    """How often `note` was called, and whether another call is expected soon."""
+    """Whether there is a supervisor, how often `note` was called, and whether another call is expected soon."""
 
+    supervised = False
     count = 0
     steady = False
+
+
+def supervised() -> bool:
+    """Whether this process has a supervisor, who says what happens to it."""
+    return _Progress.supervised
 
 
 def note(*, steady: bool) -> None:
@@ -48,6 +54,7 @@ def answer_supervisor() -> None:
     number = os.environ.pop(SOCKET, None)  # it is not for the processes that this one starts
     if number is None:
         return
+    _Progress.supervised = True
     supervisor = socket.socket(fileno=int(number))
     if sys.platform == "linux":  # a process that is stopped would not notice, and hear of no signal but this one
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -24,6 +24,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from hrlspec.run import heartbeat
 from hrlspec.run.errors import FAILED, UserError, in_words, main_guard
 
 T = TypeVar("T")
@@ -192,11 +193,10 @@ def _leave(error: BaseException, stderr: TextIO) -> NoReturn:
 
     try:
         if isinstance(error, jax.errors.JaxRuntimeError):
-            print(
-                f"error: the processes lost each other ({in_words(error)}); --resume goes on from the last checkpoint",
-                file=sys.stderr,
-            )
             status = LOST
+            if not heartbeat.supervised():
+                said = f"error: the processes lost each other ({in_words(error)})"
+                print(f"{said}; --resume goes on from the last checkpoint", file=sys.stderr)
         else:
             status = main_guard(again)
     except SystemExit as stop:

@@ -25,7 +25,8 @@ from hrlspec.run.hosts import LOST
 from hrlspec.run.platform import cores
 from hrlspec.run.signals import INTERRUPTED, StopRequest, polled_signals
 
-# Until a process counts as stopped. Before it has done anything it loads libraries, which may keep it from any sign.
+# Until a process counts as stopped. Where it does not go from iteration to iteration it may load libraries, which keep
+# it from any sign meanwhile, on a busy machine for seconds.
 SILENCE_SECONDS, LOADING_SECONDS = 5.0, 15.0
 STEADY_SECONDS, STEADY_TIMES = 10.0, 10.0  # how long an iteration may take at least, and in terms of the longest
 _PARTING_SECONDS = 2.0  # for the others to end by themselves, and say why
@@ -55,7 +56,7 @@ class Watch:
 
     def complaint(self, now: float) -> str | None:
         """What is wrong with it, if anything."""
-        silence = SILENCE_SECONDS if self._count else LOADING_SECONDS
+        silence = SILENCE_SECONDS if self._steady else LOADING_SECONDS
         if self._beat is not None and now - self._beat > silence:
             return f"has not answered for {now - self._beat:.0f} s"
         limit = self._patience

@@ -183,7 +183,7 @@ def test_silence() -> None:
     watch.hear(99.0, 0, False)
     assert watch.complaint(99.0 + supervisor.LOADING_SECONDS) is None
     assert watch.complaint(100.0 + supervisor.LOADING_SECONDS) == "has not answered for 16 s"
-    watch.hear(200.0, 1, False)
+    watch.hear(200.0, 1, True)
     assert watch.complaint(200.0 + supervisor.SILENCE_SECONDS) is None
     assert watch.complaint(201.0 + supervisor.SILENCE_SECONDS) == "has not answered for 6 s"
 
