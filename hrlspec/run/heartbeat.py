@@ -59,15 +59,20 @@ def answer_supervisor() -> None:
     if sys.platform == "linux":  # a process that is stopped would not notice, and hear of no signal but this one
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     supervisor.settimeout(BEAT_SECONDS)
-    signals.redirect(lambda name: supervisor.sendall(f"{name}\n".encode()))
+
+    def tell(name: str) -> None:
+        with contextlib.suppress(OSError):
+            supervisor.sendall(f"{name}\n".encode())
+
+    signals.redirect(tell)
     threading.Thread(target=_answer, args=(supervisor,), name="heartbeat", daemon=True).start()
 
 
 def _answer(supervisor: socket.socket) -> None:
     while True:
         try:
-            supervisor.sendall(f"{_Progress.count} {_Progress.steady:d}\n".encode())
-            with contextlib.suppress(TimeoutError):
+            with contextlib.suppress(TimeoutError):  # it has nothing to say, or has been stopped and reads nothing
+                supervisor.sendall(f"{_Progress.count} {_Progress.steady:d}\n".encode())
                 said = supervisor.recv(64).decode()
                 if not said:
                     break

@@ -29,7 +29,9 @@ from hrlspec.run.signals import INTERRUPTED, StopRequest, polled_signals
 # it from any sign meanwhile, on a busy machine for seconds.
 SILENCE_SECONDS, LOADING_SECONDS = 5.0, 15.0
 STEADY_SECONDS, STEADY_TIMES = 10.0, 10.0  # how long an iteration may take at least, and in terms of the longest
-_PARTING_SECONDS = 2.0  # for the others to end by themselves, and say why
+_PARTING_SECONDS = 2.0  # for the others to end by themselves, and say why,
+_ORDERLY_SECONDS = 30.0  # and to bring to an end what they do if the first one ended in order
+_FINAL = (BAD_INPUT, FAILED, INTERRUPTED)  # statuses of processes that need not be tried again
 _LONGEST_DELAY = 60.0  # seconds before another try
 
 
@@ -170,11 +172,12 @@ def _attempt(commands: Sequence[Sequence[str]], patience: float, stop: StopReque
         for worker in workers:
             selector.register(worker.socket, selectors.EVENT_READ, worker)
         trouble = _watch(workers, selector, stop)
-        end = time.monotonic() + _PARTING_SECONDS
+        orderly = any(worker.status in _FINAL for worker in workers)
+        end = time.monotonic() + (_ORDERLY_SECONDS if orderly else _PARTING_SECONDS)
         while any(worker.status is None for worker in workers) and time.monotonic() < end and trouble is None:
             time.sleep(0.05)
     statuses = [worker.status for worker in workers]
-    for status in (BAD_INPUT, FAILED, INTERRUPTED):
+    for status in _FINAL:
         if status in statuses:
             return status, None
     ended = [(index, status) for index, status in enumerate(statuses) if status not in (None, OK)]
