@@ -22,17 +22,29 @@ BEAT_SECONDS = 0.5
 _PR_SET_PDEATHSIG = 1
 
 
-class _Progress:
-    """Whether there is a supervisor, how often `note` was called, and whether another call is expected soon."""
+class _Connection:
+    """With the supervisor, if there is one: how often `note` was called, and whether another call is expected soon."""
 
-    supervised = False
+    socket: socket.socket | None = None
     count = 0
     steady = False
+
+    @classmethod
+    def tell(cls, text: str) -> None:
+        """Says a line, or drops it where the supervisor is gone or has been stopped and reads nothing."""
+        if cls.socket is not None:
+            with contextlib.suppress(OSError):
+                cls.socket.sendall(f"{text}\n".encode())
+
+    @classmethod
+    def beat(cls) -> None:
+        """Says how far this process is."""
+        cls.tell(f"{cls.count} {cls.steady:d}")
 
 
 def supervised() -> bool:
     """Whether this process has a supervisor, who says what happens to it."""
-    return _Progress.supervised
+    return _Connection.socket is not None
 
 
 def note(*, steady: bool) -> None:
@@ -42,7 +54,9 @@ def note(*, steady: bool) -> None:
         steady: whether the next thing will take about as long as this one did. It does not where a program is compiled
             next, or agents are evaluated.
     """
-    _Progress.count, _Progress.steady = _Progress.count + 1, steady
+    _Connection.count, _Connection.steady = _Connection.count + 1, steady
+    if not steady:
+        _Connection.beat()  # what comes next may keep the other thread from it
 
 
 def answer_supervisor() -> None:
@@ -54,30 +68,25 @@ def answer_supervisor() -> None:
     number = os.environ.pop(SOCKET, None)  # it is not for the processes that this one starts
     if number is None:
         return
-    _Progress.supervised = True
-    supervisor = socket.socket(fileno=int(number))
+    _Connection.socket = supervisor = socket.socket(fileno=int(number))
     if sys.platform == "linux":  # a process that is stopped would not notice, and hear of no signal but this one
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     supervisor.settimeout(BEAT_SECONDS)
-
-    def tell(name: str) -> None:
-        with contextlib.suppress(OSError):
-            supervisor.sendall(f"{name}\n".encode())
-
-    signals.redirect(tell)
+    signals.redirect(_Connection.tell)
     threading.Thread(target=_answer, args=(supervisor,), name="heartbeat", daemon=True).start()
 
 
 def _answer(supervisor: socket.socket) -> None:
     while True:
+        _Connection.beat()
         try:
-            with contextlib.suppress(TimeoutError):  # it has nothing to say, or has been stopped and reads nothing
-                supervisor.sendall(f"{_Progress.count} {_Progress.steady:d}\n".encode())
-                said = supervisor.recv(64).decode()
-                if not said:
-                    break
-                for name in said.split():
-                    signals.deliver(name)
+            said = supervisor.recv(64).decode()
+        except TimeoutError:
+            continue
         except OSError:
             break
+        if not said:
+            break
+        for name in said.split():
+            signals.deliver(name)
     os._exit(signals.INTERRUPTED)

@@ -17,6 +17,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from hrlspec.run.errors import BAD_INPUT, FAILED, OK
@@ -56,9 +57,9 @@ class Watch:
                 self._longest = max(self._longest, now - self._changed)
             self._changed, self._count, self._steady = now, count, steady
 
-    def complaint(self, now: float) -> str | None:
-        """What is wrong with it, if anything."""
-        silence = SILENCE_SECONDS if self._steady else LOADING_SECONDS
+    def complaint(self, now: float, stopped: bool = False) -> str | None:
+        """What is wrong with it, if anything; the system may know that it has been stopped."""
+        silence = SILENCE_SECONDS if stopped or self._steady else LOADING_SECONDS
         if self._beat is not None and now - self._beat > silence:
             return f"has not answered for {now - self._beat:.0f} s"
         limit = self._patience
@@ -88,6 +89,13 @@ class _Worker:
     def status(self) -> int | None:
         """The exit status, negative for a signal; ``None`` while it runs, and if it was ended from here."""
         return None if self._killed else self._process.poll()
+
+    @property
+    def stopped(self) -> bool:
+        """Whether somebody has stopped it, as far as the system says so."""
+        with contextlib.suppress(OSError):
+            return Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()[0] == "T"
+        return False
 
     def read(self) -> list[str] | None:
         """The names of signals that it got; ``None`` if it hears no more."""
@@ -207,8 +215,8 @@ def _watch(workers: Sequence[_Worker], selector: selectors.BaseSelector, stop: S
             return None
         now = time.monotonic()
         for index, worker in enumerate(workers):
-            complaint = worker.watch.complaint(now) if statuses[index] is None else None
-            if complaint:
+            complaint = worker.watch.complaint(now, worker.stopped)
+            if complaint and statuses[index] is None:
                 return f"process {index} {complaint}"
 
 

@@ -118,7 +118,7 @@ def test_who_gets_further_may_fail_as_often_as_it_likes(tmp_path: Path) -> None:
 
 @LINUX
 def test_a_process_that_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(supervisor, "LOADING_SECONDS", 2.0)
+    monkeypatch.setattr(supervisor, "SILENCE_SECONDS", 2.0)
     group = Group(tmp_path, (f"{-signal.SIGSTOP}/0", "wait/0"))
     assert group.run() == 0
     assert group.said[0].startswith("process 0 has not answered for ")
@@ -181,6 +181,7 @@ def test_silence() -> None:
     assert watch.complaint(99.0) is None  # it has not come so far
     watch.hear(99.0, 0, False)
     assert watch.complaint(99.0 + supervisor.LOADING_SECONDS) is None
+    assert watch.complaint(100.0 + supervisor.SILENCE_SECONDS, stopped=True) == "has not answered for 6 s"
     assert watch.complaint(100.0 + supervisor.LOADING_SECONDS) == "has not answered for 16 s"
     watch.hear(200.0, 1, True)
     assert watch.complaint(200.0 + supervisor.SILENCE_SECONDS) is None
