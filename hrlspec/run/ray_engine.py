@@ -20,11 +20,11 @@ from typing import Any, Self
 
 import ray
 
+from hrlspec.run import platform
 from hrlspec.run.errors import UserError, in_words
 from hrlspec.run.folder import is_being_written
 from hrlspec.run.places import Place, held_cores
 from hrlspec.run.planned import PlannedRun, problem_of, start_run
-from hrlspec.run import platform
 
 RETRIES = 10
 """Nodes that a run may lose."""

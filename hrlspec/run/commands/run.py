@@ -65,9 +65,7 @@ def main(argv: Sequence[str], *, program: str = "hrlspec run") -> None:
         _run_all(runs, given, flags, hosts)
 
 
-def _run_all(
-    runs: Sequence[tuple[Experiment, Path]], given: AgentFile | None, flags: RunFlags, hosts: Hosts
-) -> None:
+def _run_all(runs: Sequence[tuple[Experiment, Path]], given: AgentFile | None, flags: RunFlags, hosts: Hosts) -> None:
     """One run after the other, and what they have in common."""
     resumed = hosts.lead(lambda: _check_folders(runs, flags))
     devices = _devices(flags, runs[0][0].config.blocks, hosts)
