@@ -70,6 +70,7 @@ def flat(params: Any) -> np.ndarray:
 # --- Training ---
 
 
+@pytest.mark.slow
 def test_training_is_the_loop_that_anybody_can_write() -> None:
     """To the bit: with the settings that the changes make, banks drawn from the seed, and what is held out left out."""
     trainer, machine = Trainer(Agent(ENV, CONFIG, METHOD)), reward_machine(ENV.propositions)

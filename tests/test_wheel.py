@@ -93,6 +93,7 @@ def test_an_agent_acts_without_training(scripts: Path, tmp_path: Path) -> None:
     assert not [*tmp_path.iterdir()]
 
 
+@pytest.mark.slow
 def test_the_command(scripts: Path, tmp_path: Path) -> None:
     """Help, a run of a few steps with pictures, what only a checkout can do."""
     hrlspec = scripts / "hrlspec"

@@ -333,6 +333,7 @@ def test_what_is_stopped_goes_on_and_what_fails_is_said(tmp_path: Path, monkeypa
     assert "letter-techniques" in (tmp_path / "page.md").read_text()
 
 
+@pytest.mark.slow
 def test_a_real_run_leaves_a_record(tmp_path: Path) -> None:
     """A tiny one, by the command that makes the others."""
     run = Run("letter", 1, Curve("ours", "hrlspec"), 0, TOTAL)

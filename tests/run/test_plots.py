@@ -144,7 +144,7 @@ def test_what_the_encoder_says_is_told(tmp_path: Path) -> None:
         plots._encode(b"no animation", tmp_path / "e.mp4")
 
 
-@pytest.mark.parametrize("name", ["walk", "flatworld", "zone"])
+@pytest.mark.parametrize("name", ["flatworld", pytest.param("zone", marks=pytest.mark.slow)])
 def test_worlds_of_discs_are_drawn_from_above(name: str, tmp_path: Path) -> None:
     """A long straight line: fewer frames than steps, every sub-task named, goals where regions are."""
     env = envs_jax.make(name)

@@ -236,6 +236,7 @@ def test_a_signal_during_the_final_evaluation(finished: Path, tmp_path: Path, mo
     assert results(folder) == results(finished)
 
 
+@pytest.mark.slow
 def test_several_seeds_skip_what_is_finished(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
