@@ -20,7 +20,7 @@ def test_continuous_integration_runs_the_test_command_of_the_readme() -> None:
     script = (ROOT / ".ci" / "run").read_text()
     assert re.search(rf"^ *{re.escape(tests)}\b", script, re.MULTILINE)
     # It installs what the linters and the site need on top of what the tests need.
-    assert re.search(r'pip" install .*-e "\.\[dev,docs\]"$', script, re.MULTILINE)
+    assert re.search(r'pip install .*-e "\.\[dev,docs\]"$', script, re.MULTILINE)
     assert "hrlspec[test]" in PROJECT["project"]["optional-dependencies"]["dev"]
     assert os.access(ROOT / ".ci" / "run", os.X_OK)
 
