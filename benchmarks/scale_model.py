@@ -63,7 +63,7 @@ class Flags:
     """Measure constants, and an iteration on two devices."""
     out: Path | None = None
     """Where the JSON goes besides standard output."""
-    only_iteration: tyro.conf.Suppress[str] = ""
+    only_iteration: str = ""
     """ENV:DEVICES:NUM_ENVS: just time iterations and print the seconds; for the processes that measure."""
 
 
