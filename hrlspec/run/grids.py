@@ -18,6 +18,7 @@ Cell = Mapping[str, str]
 """One value of each setting."""
 
 _OWN = ("seed", "num_seeds", "out", "resume")
+_MOST_SEEDS = 10_000  # a range with a slip of the pen would fill the memory
 _NAME = re.compile(r"[A-Za-z]\w*(\.[A-Za-z]\w*)*")
 _SWITCHED = {"true": True, "false": False}
 
@@ -60,6 +61,8 @@ def seeds_of(text: str) -> list[int]:
             raise UserError(f"--seeds {text}: expected numbers and ranges, such as 0-4 or 0,2,7-9, found {part!r}")
         if int(found[2] or found[1]) > LAST_SEED:
             raise UserError(f"--seeds {text}: expected seeds up to {LAST_SEED}")
+        if int(found[2] or found[1]) - int(found[1]) >= _MOST_SEEDS:
+            raise UserError(f"--seeds {text}: expected at most {_MOST_SEEDS} seeds in a range")
         seeds += range(int(found[1]), int(found[2] or found[1]) + 1)
     if len({*seeds}) < len(seeds):
         raise UserError(f"--seeds {text}: there is a seed twice")

@@ -35,6 +35,7 @@ def test_seeds() -> None:
         ("0-2,2", "a seed twice"),
         ("9999999999", "expected seeds up to 2147483647"),
         ("0-9999999999", "expected seeds up to 2147483647"),
+        ("0-999999999", "expected at most 10000 seeds in a range"),
     ],
 )
 def test_bad_seeds(text: str, said: str) -> None:
