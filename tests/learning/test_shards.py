@@ -77,6 +77,12 @@ def moved(state: TrainState, devices: int) -> TrainState:
     return there
 
 
+def moved_by_checkpoint(state: TrainState, devices: int, folder: Path) -> TrainState:
+    """The state, saved and restored on so many devices."""
+    checkpoint.save(folder, 1, state)
+    return checkpoint.load(folder, fresh(devices)).state
+
+
 def assert_agree(one: TrainState, other: TrainState) -> None:
     """Equal, but for the last digits of floats."""
     for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
@@ -105,23 +111,34 @@ def test_nor_does_a_run_to_the_bit(devices: int) -> None:
     assert hashes[0] == hashes[1]
 
 
-@pytest.mark.parametrize(("before", "after"), [(1, 4), *(pytest.param(n, m, marks=SLOW) for n, m in ((4, 1), (2, 4)))])
-def test_a_checkpoint_goes_on_on_another_number_of_devices(before: int, after: int, tmp_path: Path) -> None:
-    state = trained(fresh(before), before, 1)
-    checkpoint.save(tmp_path, 1, state)
-    restored = checkpoint.load(tmp_path, fresh(after)).state
-    assert state_hash(restored) == state_hash(state)
+@pytest.mark.parametrize(("before", "after"), [(4, 1), *(pytest.param(*two, marks=SLOW) for two in ((1, 4), (2, 4)))])
+def test_a_checkpoint_is_restored_on_another_number_of_devices(before: int, after: int, tmp_path: Path) -> None:
+    restored = moved_by_checkpoint(fresh(before), after, tmp_path)
+    assert state_hash(restored) == state_hash(fresh(before))
     assert {x.sharding for x in jax.tree.leaves(restored)} == {x.sharding for x in jax.tree.leaves(fresh(after))}
+
+
+@SLOW
+@pytest.mark.parametrize(("before", "after"), [(1, 4), (4, 1), (2, 4)])
+def test_and_goes_on_there(before: int, after: int, tmp_path: Path) -> None:
+    state = trained(fresh(before), before, 1)
+    restored = moved_by_checkpoint(state, after, tmp_path)
     assert_agree(trained(restored, after, 1), trained(state, before, 1))
 
 
 def test_each_device_has_its_environments_and_all_parameters() -> None:
-    state = trained(fresh(4), 4, 1)
+    state = fresh(4)
     assert {len(x.sharding.device_set) for x in jax.tree.leaves(state)} == {4}
     for x in jax.tree.leaves((state.collector, state.tasks)):
         assert [shard.data.shape[0] for shard in x.addressable_shards] == [32] * 4 or not x.size
     for x in jax.tree.leaves((state.params, state.optimisers)):
         assert x.is_fully_replicated
+
+
+@SLOW
+def test_and_after_an_iteration() -> None:
+    for before, after in zip(jax.tree.leaves(fresh(4)), jax.tree.leaves(trained(fresh(4), 4, 1)), strict=True):
+        assert after.sharding.is_equivalent_to(before.sharding, before.ndim)
 
 
 @pytest.mark.parametrize("devices", [1, 2, 4])
