@@ -7,6 +7,11 @@ from typing import Any
 from rich.console import Console
 
 
+def counted(number: int, thing: str) -> str:
+    """A number of things: ``1 task``, ``2,000 tasks``."""
+    return f"{number:,} {thing}" if number == 1 else f"{number:,} {thing}s"
+
+
 class PlainConsole(Console):
     """A console to which text is text: brackets are no markup, and nothing is coloured that is not told to be.
 

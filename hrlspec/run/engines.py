@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol, Self
 
 from hrlspec.config import Checked, ConfigError, setting
-from hrlspec.run.console import PlainConsole
+from hrlspec.run.console import PlainConsole, counted
 from hrlspec.run.errors import Interrupted
 from hrlspec.run.extras import check_ray
 from hrlspec.run.places import Place, places
@@ -124,7 +124,7 @@ def carry_out(
 
 def failures(failed: Sequence[PlannedRun]) -> str:
     """What a command ends with whose runs failed."""
-    return f"{len(failed)} runs failed, the first is {failed[0].name}; the same command tries again"
+    return f"{counted(len(failed), 'run')} failed, the first is {failed[0].name}; the same command tries again"
 
 
 class LocalEngine:

@@ -12,6 +12,7 @@ from rich.table import Table
 from hrlspec.evaluation import Aggregate, LtlResult, SuiteResult
 from hrlspec.evaluation.results import OVER_EPISODES, OVER_TASKS
 from hrlspec.evaluation.stats import Interval
+from hrlspec.run.console import counted
 from hrlspec.run.learner import FinalResults
 
 _NAMES = {
@@ -42,7 +43,7 @@ def suite_table(result: SuiteResult) -> Table:
     if total.myopic_spl is not None:
         remarks.append(f"nearest goal first: success {total.myopic_success_rate:.3f}, SPL {total.myopic_spl:.3f}")
     table = plain_table(
-        f"Unseen tasks: {result.suite} ({len(result.per_task)} tasks, {total.episodes} episodes)",
+        f"Unseen tasks: {result.suite} ({counted(len(result.per_task), 'task')}, {counted(total.episodes, 'episode')})",
         ["tasks", *(_NAMES[name] for name in names)],
         "; ".join(remarks),
     )
@@ -62,8 +63,9 @@ def ltl_table(result: LtlResult) -> Table:
         remarks.append("* some paths to acceptance were left out, for a tree was too small")
     if any(score.silent for score in result.per_formula):
         remarks.append("† some way on begins where nothing holds, which no sub-task asks for")
+    formulas, episodes = counted(len(result.per_formula), "formula"), counted(result.episodes, "episode")
     table = plain_table(
-        f"{result.suite} ({len(result.per_formula)} formulas, {result.episodes} episodes of each)",
+        f"{result.suite} ({formulas}, {episodes} of each)",
         ["formula", "rounds", "violated"] if result.forever else ["formula", "success", "violated", "steps"],
         "; ".join(remarks),
     )

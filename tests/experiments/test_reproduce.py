@@ -317,7 +317,7 @@ def test_what_is_stopped_goes_on_and_what_fails_is_said(tmp_path: Path, monkeypa
         reproduce.main(flags)
     assert len(started) == 2
     assert not (tmp_path / "out").exists()
-    with pytest.raises(SystemExit, match="1 runs failed, the first is letter-ours-paper-set2-no-shield-seed0"):
+    with pytest.raises(SystemExit, match="1 run failed, the first is letter-ours-paper-set2-no-shield-seed0"):
         reproduce.main(flags)
     runs = PANELS["letter-techniques"].runs(1, None)
     kept = read_records(runs, tmp_path / "out")

@@ -445,7 +445,7 @@ def test_an_environment_and_a_method_of_somebody_elses(
     assert task["task"] == "achieve blue; achieve red; achieve blue"
     Path("run/summary.json").unlink()
     assert call(*flags, "--resume") == 0
-    assert "(1 tasks, 10 episodes)" in capsys.readouterr().out
+    assert "(1 task, 10 episodes)" in capsys.readouterr().out
     Path("run/tasks/dag.txt").write_bytes(b"\xff")
     Path("run/summary.json").unlink()
     assert call(*flags, "--resume") == 2

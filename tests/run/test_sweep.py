@@ -123,7 +123,7 @@ def test_who_fails_is_named_and_the_others_go_on(
     fake: Fake, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fake.fails = ("discount=0.9/seed0",)
-    with pytest.raises(SystemExit, match=r"1 runs failed, the first is discount=0.9/seed0; the same command") as stop:
+    with pytest.raises(SystemExit, match=r"1 run failed, the first is discount=0.9/seed0; the same command") as stop:
         call("--out", str(tmp_path), *GRID, "--seeds", "0-1", "--", *SHARED)
     assert isinstance(stop.value.code, str)  # which is status 1
     log = tmp_path / "discount=0.9" / "seed0.log"

@@ -58,7 +58,7 @@ def lines(table: object) -> list[str]:
 
 def test_a_suite() -> None:
     found = lines(suite_table(result()))
-    assert "Unseen tasks: dag (2 tasks, 1000 episodes)" in found[0]
+    assert "Unseen tasks: dag (2 tasks, 1,000 episodes)" in found[0]
     (row,) = [line.split() for line in found if line.strip().startswith("all ")]
     assert row == ["all", "0.983", "[.88,1.00]", "0.983", "[-.12,1.20]", "12.3", "[11.1,13.9]", "0.500"]
     (failed,) = [line.split() for line in found if line.strip().startswith("depth 4")]

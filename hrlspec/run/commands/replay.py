@@ -15,7 +15,7 @@ from envs_jax import Environment
 from envs_jax.base import Layout
 from hrlspec.config import Checked, setting
 from hrlspec.run import platform
-from hrlspec.run.console import result_console
+from hrlspec.run.console import counted, result_console
 from hrlspec.run.errors import UserError
 from hrlspec.run.flags import parse_flags
 from hrlspec.run.folder import check_writable
@@ -93,7 +93,9 @@ def main(argv: Sequence[str], *, program: str = "hrlspec replay") -> None:
     flags.out.parent.mkdir(parents=True, exist_ok=True)
     flags.out.write_text(text, encoding="utf-8", newline="\n")
     size = len(text.encode()) / 1000
-    result_console().say(f"{flags.out}: {flags.episodes} episodes in {size:.0f} kB, to be opened in a browser")
+    result_console().say(
+        f"{flags.out}: {counted(flags.episodes, 'episode')} in {size:.0f} kB, to be opened in a browser"
+    )
 
 
 def _agents(flags: ReplayFlags) -> list[_Shown]:

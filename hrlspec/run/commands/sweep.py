@@ -23,7 +23,7 @@ from hrlspec.config import setting
 from hrlspec.evaluation.stats import Interval
 from hrlspec.run.commands.compare import SCORES, means_of, scores_of, scores_to_json
 from hrlspec.run.commands.run import check_beginning, check_folder
-from hrlspec.run.console import PlainConsole, result_console
+from hrlspec.run.console import PlainConsole, counted, result_console
 from hrlspec.run.engines import EngineFlags, carry_out, engine_of, failures
 from hrlspec.run.errors import UserError
 from hrlspec.run.files import write_atomically
@@ -105,7 +105,7 @@ def main(argv: Sequence[str], *, program: str = "hrlspec sweep") -> None:
     unfinished = {run for some in planned for run in some.missing}
     missing = [run for run in by_seed if run in unfinished]
     console = PlainConsole(stderr=True)
-    console.say(f"{len(planned)} cells, {len(by_seed)} runs, {len(missing)} of them missing")
+    console.say(f"{counted(len(planned), 'cell')}, {counted(len(by_seed), 'run')}, {len(missing)} of them missing")
     if flags.dry_run:
         for run in missing[: flags.max_runs]:
             print(program.removesuffix("sweep") + "run", *run.arguments)
