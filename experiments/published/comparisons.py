@@ -43,7 +43,7 @@ COMPARISONS = {
     for comparison in (
         Comparison(
             "letter12",
-            500_000,
+            1_500_000,
             ("jaxolotl/letter_finite", "jaxolotl/letter_infinite", "deepltl/letter_finite", "deepltl/letter_infinite"),
             f"{_BUDGET.format('15 to 20 million')}; DeepLTL has 500 episodes and five seeds",
         ),
