@@ -111,6 +111,10 @@ class NetworkConfig(Checked):
     """Scale of the sub-task features that condition the low level: unscaled, a few binary features carry little weight
     beside a hundred of the latent. The embedding of the remaining task is not scaled, or it would outweigh the
     sub-task. Without a sub-task, conditioned on the whole task, the embedding is scaled."""
+    chart: tuple[int, ...] = setting((), least=1)
+    """Layers of a chart: a network from the shared part of the observation to features of each proposition, as many as
+    the last width says, which the low level sees by role beside what the world shows. For worlds that show the position
+    alone: what is learned of a region in front of one goal is known of it in front of all others. Empty: no chart."""
     lookahead: int = setting(2, least=0)
     """How many later sub-tasks have a role of their own."""
     memory: int = setting(0, least=0)

@@ -44,6 +44,7 @@ BOUNDS: dict[type, dict[str, tuple[float, float]]] = {
     NetworkConfig: {
         "latent": (1, INF),
         "conv_channels": (1, INF),
+        "chart": (1, INF),
         "encoder_mlp": (1, INF),
         "task_features": (1, INF),
         "task_rounds": (0, INF),

@@ -75,6 +75,7 @@ class LowLevel:
         return Controller(
             self.config.network,
             self.actions.num_outputs,
+            self.env.num_propositions,
             self.sees,
             self.follows_plan,
             self.env.symmetries if isinstance(self.env, Symmetric) else None,

@@ -329,6 +329,35 @@ def test_a_scaled_task_is_a_task_with_larger_weights(whole_task: bool) -> None:
         assert np.abs(np.asarray(a - old)).max() > 1e-3
 
 
+def test_what_is_charted_of_a_proposition_is_seen_by_its_role() -> None:
+    """Propositions that change places in the chart, and in the weights that know them by name, do so in the task."""
+    network = dataclasses.replace(small_config().network, roles=True, chart=(8, 3), memory=0)
+    agent, order = small_agent(ENV, small_config(network=network)), np.array([2, 0, 3, 1])
+    params = random_params(agent, 3)
+
+    def renamed(path: Any, x: jax.Array) -> jax.Array:
+        name = jax.tree_util.keystr(path)
+        if "['chart']['Dense_1']" in name:
+            return x.reshape(*x.shape[:-1], len(order), -1)[..., order, :].reshape(x.shape)
+        if name.endswith(("['actor']['Dense_0']['kernel']", "['critic']['Dense_0']['kernel']")):
+            rows = np.concatenate([network.latent + order, network.latent + len(order) + order])
+            return x.at[network.latent + np.arange(len(rows))].set(x[rows])
+        return x[order] if name.endswith("['task_embedding']['edge']['kernel']") else x
+
+    task = instruction(np.eye(len(order), dtype=np.float32)[: 2 + network.lookahead], network)
+    other = instruction(np.eye(len(order), dtype=np.float32)[: 2 + network.lookahead, order], network)
+    blind = VIEW._replace(propositions=jnp.zeros_like(VIEW.propositions))
+    there = {**params, "low": jax.tree_util.tree_map_with_path(renamed, params["low"])}
+    for before, after, unknown in zip(
+        agent.low.control(params, blind, task),
+        agent.low.control(there, blind, other),
+        agent.low.control(params, blind, other),
+        strict=True,
+    ):
+        np.testing.assert_allclose(after, before, rtol=1e-5, atol=1e-6)
+        assert np.abs(np.asarray(unknown - before)).max() > 1e-3
+
+
 def test_the_low_level_turns_with_the_world() -> None:
     """Seen through any of the eight turns, it acts as before, turned, and values what it sees alike."""
     env = envs_jax.make("letter")

@@ -63,6 +63,7 @@ class Controller(nn.Module):
     Attributes:
         config: sizes.
         num_outputs: of the actor; they describe a distribution of `hrlspec.agent.distributions`.
+        num_propositions: P.
         sees: the part of the task that it is conditioned on.
         follows_plan: whether what remains is the one sequence planned by the high level, instead of a tree.
         symmetries: how the world can be turned or reflected, if at all.
@@ -70,6 +71,7 @@ class Controller(nn.Module):
 
     config: NetworkConfig
     num_outputs: int
+    num_propositions: int
     sees: Sees = "future"
     follows_plan: bool = False
     symmetries: Symmetries | Reflections | None = None
@@ -79,6 +81,7 @@ class Controller(nn.Module):
         c = self.config
         self.task_embedding = TaskEmbedding(c.task_features, c.task_rounds, negatives=self.sees == "whole task")
         self.encoder = Encoder(c.latent, c.conv_channels, c.encoder_mlp)
+        self.chart = MLP((*c.chart[:-1], self.num_propositions * c.chart[-1])) if c.chart else None
         self.actor = MLP((*c.actor, self.num_outputs), final_scale=0.01)
         self.critic = MLP((*c.critic, 1), tanh=True, final_scale=1.0)
 
@@ -129,7 +132,11 @@ class Controller(nn.Module):
 
     def respond(self, sight: Sight, instruction: Instruction) -> tuple[Float32[Array, " outputs"], Float32[Array, ""]]:
         """The actor's outputs ``[num_outputs]`` and the value ``[]`` of what is seen, see `__call__`."""
-        latent = nn.relu(self.encoder(sight.planes, sight.shared))
+        shared = sight.shared
+        if self.chart is not None:
+            charted = self.chart(shared).reshape(self.num_propositions, -1)
+            shared = jnp.concatenate([shared, self._by_role(charted, instruction).reshape(-1)])
+        latent = nn.relu(self.encoder(sight.planes, shared))
         x = jnp.concatenate([latent, *self._of_task(instruction)])
         outputs, frame = self.actor(x), sight.frame
         if frame is not None and isinstance(self.symmetries, Symmetries):
