@@ -28,7 +28,11 @@ from hrlspec.run.run_flags import experiments_of, parse_run
 from hrlspec.run.signals import leave
 
 AGENTS: dict[str, tuple[str, ...]] = {
-    name: ("--env", name, "--seed", "0") for name in ("letter", "letter12", "walk", "flatworld", "zone", "zone-nm")
+    name: ("--env", name, "--seed", "0")
+    for name in (
+        *("letter", "letter12", "walk", "flatworld", "zone", "zone-nm"),
+        *("zone-jaxolotl", "zone-nm-jaxolotl", "conveyor-simple-8"),
+    )
 }
 """The flags of the run that makes each, by its name."""
 PAGE = Path("docs/pretrained.md")

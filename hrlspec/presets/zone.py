@@ -45,6 +45,11 @@ def zone(settings: Settings, recipe: Recipe) -> Settings:
     return settings if recipe == "hrlspec" else _of_paper(settings)
 
 
+def _point_mass(settings: Settings, recipe: Recipe) -> Settings:
+    """The peers' point mass, which stops and turns at once: half as many steps."""
+    return zone(settings, recipe).evolve({"config.total_steps": 5_000_000})
+
+
 def _of_paper(settings: Settings) -> Settings:
     """Recipe paper, whose encoder does not know which colour is the goal: hard to learn in 4 M steps."""
     return settings.evolve(
@@ -71,6 +76,8 @@ def zone_with_bonuses(settings: Settings, recipe: Recipe) -> Settings:
 
 
 _BONUSES = (Bonus("green", "red", 10.0), Bonus("red", "blue", 20.0, ("yellow",)))
+# The paper's rules are about blue, which is purple among the peers' colours.
+_POINT_MASS_BONUSES = (Bonus("green", "red", 10.0), Bonus("red", "purple", 20.0, ("yellow",)))
 _LEARNING_RATES: dict[tuple[Recipe, str], float] = {
     ("paper", "ours"): 1.4e-3,
     ("paper", "option"): 1.4e-3,
@@ -122,13 +129,13 @@ def _where_one_vanishes(colours: Sequence[str], first: str, second: str) -> dict
     return {"dag": dag, "order": order}
 
 
-def _preset(name: str, suites: Mapping[str, SuiteRule], bonuses: tuple[Bonus, ...] = _BONUSES) -> Preset:
+def _preset(name: str, suites: Mapping[str, SuiteRule], *, peers: bool = False) -> Preset:
     return Preset(
         name,
         functools.partial(envs_jax.make, name),
-        zone,
+        _point_mass if peers else zone,
         zone_with_bonuses,
-        bonuses=bonuses,
+        bonuses=_POINT_MASS_BONUSES if peers else _BONUSES,
         learning_rates=_LEARNING_RATES,
         suites=with_validation(suites),
     )
@@ -137,9 +144,5 @@ def _preset(name: str, suites: Mapping[str, SuiteRule], bonuses: tuple[Bonus, ..
 ZONE = _preset("zone", {"dag": _DAG, "reach_avoid": REACH_AVOID, "reach": REACH})
 ZONE_LTL2ACTION = _preset("zone-ltl2action", {"dag": _DAG})
 ZONE_NM = _preset("zone-nm", _where_one_vanishes(COLOURS, "blue", "green"))
-# The paper's rules are about blue, which is purple here.
-_POINT_MASS_BONUSES = (Bonus("green", "red", 10.0), Bonus("red", "purple", 20.0, ("yellow",)))
-ZONE_JAXOLOTL = _preset("zone-jaxolotl", {"dag": _DAG}, _POINT_MASS_BONUSES)
-ZONE_NM_JAXOLOTL = _preset(
-    "zone-nm-jaxolotl", _where_one_vanishes(point_mass.COLOURS, "purple", "green"), _POINT_MASS_BONUSES
-)
+ZONE_JAXOLOTL = _preset("zone-jaxolotl", {"dag": _DAG}, peers=True)
+ZONE_NM_JAXOLOTL = _preset("zone-nm-jaxolotl", _where_one_vanishes(point_mass.COLOURS, "purple", "green"), peers=True)

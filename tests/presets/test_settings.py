@@ -93,6 +93,7 @@ def test_learning_rates(name: str, recipe: Recipe, ours: float, ltl2action: floa
         ("zone", "paper", 10_000_000, 256, 128, 0.998, 0.998),
         ("zone", "hrlspec", 10_000_000, 128, 128, 0.998, 0.998),
         ("zone-nm", "hrlspec", 10_000_000, 128, 128, 0.998, 0.998),
+        ("zone-jaxolotl", "hrlspec", 5_000_000, 128, 128, 0.998, 0.998),
     ],
 )
 def test_sizes_of_a_run(
