@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +58,11 @@ def rate(step: Callable[[Any], Any], carry: Any, steps: int, seconds: float) -> 
         carry = jax.block_until_ready(step(carry))
         rates.append(steps / (time.perf_counter() - before))
     return {"median": statistics.median(rates), "min": min(rates), "max": max(rates), "calls": len(rates)}
+
+
+def spread(values: Sequence[float], digits: int) -> Mapping[str, float]:
+    """Median, least and most."""
+    return {of.__name__: round(of(values), digits) for of in (statistics.median, min, max)}
 
 
 def environment(

@@ -14,7 +14,6 @@ import dataclasses
 import json
 import os
 import re
-import statistics
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -23,6 +22,7 @@ from typing import Any
 
 import tyro
 
+from benchmarks.common import spread
 from hrlspec.presets import Recipe
 from hrlspec.run.errors import UserError, main_guard
 from hrlspec.run.hosts import local_address
@@ -137,11 +137,6 @@ def _commit(root: Path) -> str:
     return answer.stdout.strip()
 
 
-def _spread(values: list[float], digits: int) -> Mapping[str, float]:
-    """Median, least and most."""
-    return {of.__name__: round(of(values), digits) for of in (statistics.median, min, max)}
-
-
 def compare(flags: Flags) -> Mapping[str, Any]:
     """Medians over the turns, and of their ratios to the first contestant's."""
     contestants = [Contestant(text, flags.env, flags.recipe) for text in flags.contestants]
@@ -154,8 +149,8 @@ def compare(flags: Flags) -> Mapping[str, Any]:
         report[f"{one.name}, {one.what['devices']} devices"] = {
             **one.what,
             "first_iteration_s": round(one.first_iteration_s, 1),
-            "steps_per_s": _spread(rates, 0),
-            "ratio": _spread(ratios, 3),
+            "steps_per_s": spread(rates, 0),
+            "ratio": spread(ratios, 3),
         }
     return report
 

@@ -19,6 +19,7 @@ from envs_jax.base import Box, Discrete, Environment, EnvParams, StepResult
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.experience import View
 from hrlspec.agent.networks.planner import PlannerConfig
+from hrlspec.checkpoint import state_hash
 from hrlspec.config import (
     Config,
     CurriculumConfig,
@@ -207,6 +208,15 @@ def random_params(agent: Agent, seed: int) -> Any:
 def on_device(tree: Any) -> Any:
     """A pytree's arrays as JAX arrays."""
     return jax.tree.map(jnp.asarray, tree)
+
+
+def assert_agree(one: Any, other: Any) -> None:
+    """Equal, but for the last digits of floats."""
+    for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        if jnp.issubdtype(x.dtype, jnp.floating):
+            np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-5)
+        else:
+            assert state_hash(x) == state_hash(y)
 
 
 def pairs(flags: Any) -> set[int]:

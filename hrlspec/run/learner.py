@@ -31,8 +31,8 @@ from hrlspec.learning.train import Trainer, TrainState
 from hrlspec.presets import Preset, Split
 from hrlspec.run.errors import UserError
 from hrlspec.run.experiment import Experiment
-from hrlspec.run.loop import Job
 from hrlspec.run.programs import Program
+from hrlspec.run.track import Job
 from hrlspec.tasks.bank import TaskBanks, joint_labels
 
 PERIODIC_TASKS = (1, 2, 5, 10)  # the most there are; each divides the number of episodes
@@ -86,18 +86,29 @@ class Learner:
         self.agent = experiment.agent
         self.env = self.agent.env
         self.trainer = Trainer(self.agent, devices)
-        self._init_program = self._program("init", Trainer.init)
-        self._iterate_program = self._program("iterate", Trainer.iterate)
+        self._init_program = self.program("init", Trainer.init, self.trainer, devices)
+        self._iterate_program = self.program("iterate", Trainer.iterate, self.trainer, devices)
         self.machine = experiment.rewards
-        self._reserved = jnp.asarray(preset.reserved)
+        self.reserved = jnp.asarray(preset.reserved)
         curriculum = experiment.config.curriculum
         try:
             given = preset.collected_tasks(curriculum.max_nodes)
             together = joint_labels(self.env, curriculum)
             number = self.env.num_propositions
-            self._banks = TaskBanks(experiment.seed, curriculum, number, preset.reserved, given, together)
+            self.banks = TaskBanks(experiment.seed, curriculum, number, preset.reserved, given, together)
         except ValueError as error:
             raise UserError(f"no training tasks with this --config.curriculum: {error}") from error
+
+    def program(self, name: str, function: Any, of: Any, devices: int) -> Program:
+        """A method of a trainer or the like; kept from run to run unless made of code that others may change."""
+        effort, kept = self.preset.effort(self.experiment.recipe), not self.experiment.is_foreign
+        return Program(name, function, of, effort=effort, kept=kept, devices=devices)
+
+    def beside(self, experiment: Experiment, preset: Preset) -> Learner:
+        """That of another seed, with the same compiled programs."""
+        other = Learner(experiment, preset, self.trainer.devices, self._given)
+        other._init_program, other._iterate_program = self._init_program, self._iterate_program
+        return other
 
     def job(self) -> Job:
         """The experiment as the host loop wants it."""
@@ -158,14 +169,9 @@ class Learner:
             self.env, suite, num_tasks=num_tasks, episodes=settings.episodes, greedy=settings.greedy
         )
 
-    def _program(self, name: str, function: Any) -> Program:
-        """A function of the trainer; kept from run to run unless it is made of code that others may change."""
-        effort, kept = self.preset.effort(self.experiment.recipe), not self.experiment.is_foreign
-        return Program(name, function, self.trainer, effort=effort, kept=kept, devices=self.trainer.devices)
-
     def _init(self) -> TrainState:
         key = jax.random.key(self.experiment.seed)
-        state: TrainState = self._init_program(key, self._banks.at(0), self.machine)
+        state: TrainState = self._init_program(key, self.banks.at(0), self.machine)
         # Copies, since the state is donated; where the fresh parameters lie.
         fresh = {name: part for name, part in state.params.items() if name in self._given}
         begun = jax.tree.map(lambda new, old: jax.device_put(jnp.array(new), old.sharding), self._given, fresh)
@@ -173,7 +179,7 @@ class Learner:
 
     def _iterate(self, state: TrainState, index: int) -> tuple[TrainState, Mapping[str, jax.Array]]:
         result: tuple[TrainState, Mapping[str, jax.Array]] = self._iterate_program(
-            state, self._banks.at(index), self.machine, self._reserved
+            state, self.banks.at(index), self.machine, self.reserved
         )
         return result
 

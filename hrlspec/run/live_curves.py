@@ -10,7 +10,7 @@ from typing import Any
 from hrlspec.run.errors import UserError
 from hrlspec.run.extras import drawing
 from hrlspec.run.folder import RunFolder, read_metrics
-from hrlspec.run.loop import Display
+from hrlspec.run.track import Display
 
 CURVES = "curves.png"
 """Their name among a run's pictures."""
@@ -26,10 +26,11 @@ class LiveCurves:
         display: who else is told.
         run: whose curves.
         name: of the run.
+        number: of runs side by side, which have the share of one.
     """
 
-    def __init__(self, display: Display, run: RunFolder, name: str) -> None:
-        self._display, self._run, self._name = display, run, name
+    def __init__(self, display: Display, run: RunFolder, name: str, number: int = 1) -> None:
+        self._display, self._run, self._name, self._number = display, run, name, number
         self._next = -math.inf
 
     def advance(self, env_steps: int, metrics: Mapping[str, float]) -> None:
@@ -46,7 +47,7 @@ class LiveCurves:
         except UserError:
             self._next = math.inf  # as it is said at the end, where it is tried again
         else:
-            self._next = time.monotonic() + seconds / _SHARE
+            self._next = time.monotonic() + self._number * seconds / _SHARE
 
 
 def draw_curves(run: RunFolder, name: str) -> float:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import statistics
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
@@ -103,6 +104,40 @@ class ProgressDisplay:
 
     def _seconds_left(self) -> float | None:
         return None if not self._rate else max(self._total - self._done, 0) / self._rate
+
+
+class MeanDisplay:
+    """Shows runs that go side by side as one: the means of their numbers, steps and their rate included.
+
+    Args:
+        display: where.
+        number: of runs; each of them tells of an iteration, or of an evaluation, before one tells of the next.
+    """
+
+    def __init__(self, display: ProgressDisplay, number: int) -> None:
+        self._display, self._number = display, number
+        self._metrics: list[Mapping[str, float]] = []
+        self._rows: list[Mapping[str, Any]] = []
+
+    def advance(self, env_steps: int, metrics: Mapping[str, float]) -> None:
+        """An iteration of one of the runs is done."""
+        self._metrics.append(metrics)
+        if len(self._metrics) == self._number:
+            self._display.advance(env_steps, _mean(self._metrics))
+            self._metrics = []
+
+    def row(self, row: Mapping[str, Any]) -> None:
+        """An evaluation of one of them is done."""
+        self._rows.append(row)
+        if len(self._rows) == self._number:
+            self._display.row({**_mean(self._rows), "env_steps": row["env_steps"]})
+            self._rows = []
+
+
+def _mean(several: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Means of the numbers that all of them have."""
+    values = {name: [one[name] for one in several] for name in several[0]}
+    return {name: statistics.fmean(some) for name, some in values.items() if all(isinstance(x, float) for x in some)}
 
 
 class _TimeLeft(ProgressColumn):

@@ -45,7 +45,13 @@ class RunFlags(Checked):
     """1: 1 for completing the task; 2: also for sub-tasks and for visiting some in order."""
     seed: int = setting(0, least=0, most=LAST_SEED)
     num_seeds: int = setting(1, least=1)
-    """Seeds to run one after another, from --seed on, each in a folder of its own."""
+    """Seeds to run, from --seed on, each in a folder of its own: one after another or side by side, whichever is
+    faster."""
+    parallel_seeds: bool = False
+    """Train the seeds side by side as one program, on a processor one or more a core, on an accelerator all at once.
+    Results do not depend on it, but for rounding where it is all at once."""
+    no_parallel_seeds: bool = False
+    """Train them one after another."""
     total_steps: int | None = setting(None, least=1, most=2**40)
     """Environment steps; the preset's if not given."""
     out: Path | None = None
@@ -58,7 +64,8 @@ class RunFlags(Checked):
     make a run longer, finished or not."""
     devices: int | Literal["auto"] = setting("auto", least=1)
     """Devices to spread the environments over, a divisor of --config.blocks; those of a processor are its cores. auto:
-    as many as there are. Several processes share them. Results do not depend on it."""
+    as many as there are. Several processes share them. Seeds side by side are spread instead of environments. Results
+    do not depend on it."""
     distributed: str | None = None
     """Several processes train one run together. auto: as SLURM, Open MPI or Kubernetes has started them; elsewhere
     HOST:PORT, where the first one listens, with --num-processes and --process-id. See also hrlspec launch."""
@@ -91,7 +98,18 @@ class RunFlags(Checked):
             raise ConfigError(
                 f"RunFlags.num_seeds is {self.num_seeds}, expected the last seed to be at most {LAST_SEED}"
             )
+        self._check_seeds()
         self._check_processes()
+
+    def _check_seeds(self) -> None:
+        if not self.parallel_seeds:
+            return
+        if self.num_seeds < 2:
+            raise ConfigError("RunFlags.parallel_seeds is True, expected --num-seeds of 2 or more with it")
+        if self.no_parallel_seeds:
+            raise ConfigError("RunFlags.parallel_seeds is True, expected no --no-parallel-seeds with it")
+        if self.distributed is not None:
+            raise ConfigError("RunFlags.parallel_seeds is True, expected no --distributed: one process trains them all")
 
     def _check_processes(self) -> None:
         given = self.num_processes, self.process_id

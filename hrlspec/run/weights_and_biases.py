@@ -40,6 +40,7 @@ class WandbRun:
                 dir=str(folder),
                 config=dict(config),
                 resume="allow",
+                reinit="create_new",  # seeds side by side have a run each
                 settings=wandb.Settings(console="off"),  # the terminal is ours
             )
             self._run.define_metric("*", step_metric="env_steps")

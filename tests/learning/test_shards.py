@@ -21,7 +21,7 @@ from hrlspec.learning.train import Trainer, TrainState
 from hrlspec.methods import ImplicitPlanner, Ours
 from hrlspec.tasks.curriculum import draw_bank
 from hrlspec.tasks.rewards import reward_machine
-from tests.probes import Corridor, on_device, quick_jit, small_agent, small_config, small_planner
+from tests.probes import Corridor, assert_agree, on_device, quick_jit, small_agent, small_config, small_planner
 
 ENV = Corridor(cells=("a", "", "bc", "", "d", "", ""), starts=(1, 3, 5), horizon=9)
 # So many that one of four devices has 32 in groups of 8: with 16, JAX 0.10.2 rounds otherwise.
@@ -81,15 +81,6 @@ def moved_by_checkpoint(state: TrainState, devices: int, folder: Path) -> TrainS
     """The state, saved and restored on so many devices."""
     checkpoint.save(folder, 1, state)
     return checkpoint.load(folder, fresh(devices)).state
-
-
-def assert_agree(one: TrainState, other: TrainState) -> None:
-    """Equal, but for the last digits of floats."""
-    for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        if jnp.issubdtype(x.dtype, jnp.floating):
-            np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-5)
-        else:
-            assert state_hash(x) == state_hash(y)
 
 
 @SLOW

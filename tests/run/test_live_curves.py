@@ -42,7 +42,9 @@ def test_the_picture_is_there_from_the_first_evaluation_on(tmp_path: Path) -> No
             assert min(image.size) > 400
 
 
-def test_drawing_costs_its_share_and_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("number", [1, 2])
+def test_drawing_costs_its_share_and_no_more(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And with others side by side no more than that together."""
     now, drawn = [1000.0], list[tuple[float, int]]()
 
     def draw(runs: Mapping[str, Sequence[Any]], file: Path) -> None:
@@ -52,12 +54,12 @@ def test_drawing_costs_its_share_and_no_more(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(live_curves, "time", SimpleNamespace(monotonic=lambda: now[0]))
     monkeypatch.setattr(curves, "learning_curves", draw)
     with open_run(tmp_path, {}, tensorboard=False) as run:
-        live = LiveCurves(Heard(), run, "name")
+        live = LiveCurves(Heard(), run, "name", number)
         for step in range(1, 101):
             run.append({"env_steps": step})
             live.row({"env_steps": step})
             now[0] += 10.0
-    assert drawn == [(1000.0 + 202.0 * i, 1 + 20 * i) for i in range(5)]
+    assert drawn == [(1000.0 + (200 * number + 2) * i, 1 + 20 * number * i) for i in range(-(-5 // number))]
 
 
 def test_what_cannot_be_drawn_is_tried_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from hrlspec.run import progress
 from hrlspec.run.console import PlainConsole
-from hrlspec.run.progress import ProgressDisplay, duration
+from hrlspec.run.progress import MeanDisplay, ProgressDisplay, duration
 
 
 class Clock:
@@ -58,6 +58,22 @@ def test_a_bar_in_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
         display.advance(200, {"episodes": 4.0, "successes": 3.0, "level": 3.0})
     assert "200/1,000 steps, 100 steps/s, level 3, success 0.75" in stream.getvalue()
     assert "0:08 left" in stream.getvalue()
+
+
+def test_runs_side_by_side_are_shown_as_their_mean(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, stream = Clock(monkeypatch), io.StringIO()
+    with ProgressDisplay(1000, "runs", console=PlainConsole(file=stream, width=200)) as display:
+        mean = MeanDisplay(display, 2)
+        clock.now += 60
+        for successes, level in ((1.0, 1.0), (3.0, 3.0)):
+            mean.advance(100, {"episodes": 4.0, "successes": successes, "level": level})
+        for success, spl in ((0.25, None), (0.5, 0.5)):
+            mean.row({"env_steps": 100, "eval/success_rate": success, "eval/spl": spl})
+    assert stream.getvalue().splitlines() == [
+        "runs: compiling",
+        "runs: 100/1,000 steps, level 2, success 0.50",
+        "runs: 100 steps, unseen tasks: success 0.375",
+    ]
 
 
 @pytest.mark.parametrize("terminal", ["xterm", "dumb"])

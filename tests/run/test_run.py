@@ -240,7 +240,7 @@ def test_a_signal_during_the_final_evaluation(finished: Path, tmp_path: Path, mo
 def test_several_seeds_skip_what_is_finished(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    flags = tiny.arguments(tmp_path, "--num-seeds", "2", "--seed", "3")
+    flags = tiny.arguments(tmp_path, "--num-seeds", "2", "--seed", "3", "--no-parallel-seeds")
     advance, calls = ProgressDisplay.advance, 0
 
     def stop_in_the_second_run(self: ProgressDisplay, env_steps: int, metrics: Any) -> None:
@@ -264,6 +264,60 @@ def test_several_seeds_skip_what_is_finished(
     assert "seeds 3 to 4" in out
     assert "interquartile mean" in out
     assert results(tmp_path / "seed3") != results(tmp_path / "seed4")
+
+
+@pytest.mark.slow
+def test_seeds_side_by_side_are_stopped_and_go_on_alone_and_together(
+    finished: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Each is what it is alone but for rounding, and from the second evaluation on nothing is compiled for them."""
+    flags = tiny.arguments(tmp_path / "both", "--num-seeds", "2", "--parallel-seeds", "--checkpoint-minutes", "0")
+    advance, row, calls = ProgressDisplay.advance, ProgressDisplay.row, 0
+
+    def stop_in_the_fourth(self: ProgressDisplay, env_steps: int, metrics: Any) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 4:
+            os.kill(os.getpid(), signal.SIGTERM)
+        advance(self, env_steps, metrics)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ProgressDisplay, "advance", stop_in_the_fourth)
+        assert call(*flags) == 130
+    assert f"in each of {tmp_path}/both/seed0 to {tmp_path}/both/seed1, --resume" in capsys.readouterr().err
+    folders = [tmp_path / "both" / f"seed{seed}" for seed in (0, 1)]
+    stopped = [checkpoint.steps(folder / "checkpoints")[-1] for folder in folders]
+    assert stopped[0] == stopped[1] < 400
+
+    shutil.copytree(folders[0], tmp_path / "alone")
+    assert call(*tiny.arguments(tmp_path / "alone", "--resume")) == 0
+
+    def log_from_now_on(self: ProgressDisplay, some: Any) -> None:
+        row(self, some)
+        jax.config.update("jax_log_compiles", True)
+
+    def log_no_longer(self: Learner, params: Any) -> Any:
+        jax.config.update("jax_log_compiles", False)
+        return final_results(self, params)
+
+    final_results = Learner.final_results
+    caplog.clear()
+    with monkeypatch.context() as patch:
+        patch.setattr(ProgressDisplay, "row", log_from_now_on)
+        patch.setattr(Learner, "final_results", log_no_longer)
+        assert call(*flags, "--resume") == 0
+    assert [said for said in caplog.messages if "ompil" in said] == []
+    assert "seeds 0 to 1" in capsys.readouterr().out
+    for folder in (folders[0], tmp_path / "alone"):
+        for mine, its in zip(rows(folder), rows(finished), strict=True):
+            assert mine == pytest.approx(its, rel=1e-2, abs=1e-3)
+    assert results(folders[0]) != results(folders[1])
+    assert call(*flags, "--resume") == 0
+    assert "seed1 is finished" in capsys.readouterr().out
 
 
 def test_parameters_that_are_not_finite_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

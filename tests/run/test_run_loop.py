@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,8 @@ from hrlspec.checkpoint import state_hash
 from hrlspec.run import signals
 from hrlspec.run.errors import Interrupted
 from hrlspec.run.folder import RunFolder, open_run, read_metrics
-from hrlspec.run.loop import PATIENCE, DivergedError, Job, Loop, UnsavedError
+from hrlspec.run.loop import Loop, Together
+from hrlspec.run.track import PATIENCE, DivergedError, Job, Track, UnsavedError
 
 STEPS, ITERATIONS, EVERY = 8, 13, 20
 
@@ -67,7 +68,7 @@ class Recorder:
 @contextmanager
 def loop(folder: Path, job: Job, display: Any = None, *, resume: bool = False, seconds: float = 1e9) -> Iterator[Loop]:
     with open_run(folder, {"seed": 0}, resume=resume, tensorboard=False) as run:
-        yield Loop(job, run, display or Recorder(), checkpoint_seconds=seconds)
+        yield Loop([Track(job, run, display or Recorder())], checkpoint_seconds=seconds)
 
 
 def train(folder: Path, job: Job, display: Any = None, *, resume: bool = False, seconds: float = 1e9) -> Any:
@@ -236,7 +237,7 @@ def test_checkpoints_of_another_run_are_refused(tmp_path: Path) -> None:
         pass
     shutil.copytree(tmp_path / "a" / "checkpoints", tmp_path / "b" / "checkpoints")
     with open_run(tmp_path / "b", {"seed": 1}, resume=True, tensorboard=False) as run:
-        it = Loop(toy(), run, Recorder(), checkpoint_seconds=1e9)
+        it = Loop([Track(toy(), run, Recorder())], checkpoint_seconds=1e9)
         with pytest.raises(checkpoint.CheckpointMismatchError, match="belongs to another run"):
             it.restore()
 
@@ -246,7 +247,7 @@ def test_a_finished_run_becomes_longer(tmp_path: Path, reference: tuple[Path, st
     for length, resume in ((7, False), (9, True), (ITERATIONS, True)):
         config = {"length": length}
         with open_run(tmp_path, config, resume=resume, may_change=("length",), tensorboard=False) as run:
-            it = Loop(toy(num_iterations=length), run, Recorder(), checkpoint_seconds=1e9)
+            it = Loop([Track(toy(num_iterations=length), run, Recorder())], checkpoint_seconds=1e9)
             state = it.train(it.restore())
     assert state_hash(state) == reference[1]
     assert [row["env_steps"] for row in read_metrics(tmp_path)] == [24, 40, 56, 64, 72, 80, 104]
@@ -309,3 +310,131 @@ def test_parameters_that_are_not_finite_are_never_saved(tmp_path: Path) -> None:
     ):
         train(tmp_path, toy(iterate=iterate), seconds=0)
     assert checkpoint.steps(tmp_path / "checkpoints")[-1] == 48
+
+
+# --- Several runs side by side ---
+
+SEEDS = (5, 6, 7)
+
+
+def seed_job(seed: int, **changes: Any) -> Job:
+    return toy(init=lambda: {"params": jnp.zeros(3), "key": jax.random.key(seed)}, **changes)
+
+
+def jointly() -> Together:
+    """A list in place of a leading axis."""
+
+    def iterate(states: Any, index: int) -> Any:
+        both = [step(state, index) for state in states]
+        return [state for state, _ in both], jax.tree.map(lambda *x: jnp.stack(x), *(metrics for _, metrics in both))
+
+    return Together(join=list, split=list, iterate=iterate)
+
+
+@contextmanager
+def loop_of_all(folder: Path, displays: Sequence[Any], *, resume: bool = False, seconds: float = 1e9) -> Iterator[Loop]:
+    with ExitStack() as stack:
+        tracks = []
+        for seed, display in zip(SEEDS, displays, strict=True):
+            run = open_run(folder / f"seed{seed}", {"seed": seed}, resume=resume, tensorboard=False)
+            tracks.append(Track(seed_job(seed), stack.enter_context(run), display))
+        yield Loop(tracks, jointly(), checkpoint_seconds=seconds)
+
+
+def train_one(folder: Path, seed: int, *, resume: bool = False) -> Any:
+    with open_run(folder, {"seed": seed}, resume=resume, tensorboard=False) as run:
+        it = Loop([Track(seed_job(seed), run, Recorder())], checkpoint_seconds=1e9)
+        return it.train(it.restore())
+
+
+@pytest.fixture(scope="module")
+def each_alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("alone")
+    for seed in SEEDS:
+        train_one(folder / f"seed{seed}", seed)
+    return folder
+
+
+def assert_as_alone(folder: Path, each_alone: Path) -> None:
+    """Rows, and the checkpoints that an ordinary run would have left."""
+    for seed in SEEDS:
+        here, there = folder / f"seed{seed}", each_alone / f"seed{seed}"
+        assert timeless(here) == timeless(there)
+        states = [checkpoint.load(one / "checkpoints", seed_job(seed).init()) for one in (here, there)]
+        assert state_hash(states[0].state) == state_hash(states[1].state)
+        for some in states:
+            for name in ("wall", "training"):
+                del some.metadata["position"][name]
+        assert states[0].metadata == states[1].metadata
+
+
+def test_runs_side_by_side_are_those_alone(tmp_path: Path, each_alone: Path) -> None:
+    displays = [Recorder() for _ in SEEDS]
+    with loop_of_all(tmp_path, displays) as it:
+        it.train(it.restore())
+    assert_as_alone(tmp_path, each_alone)
+    for display in displays:
+        assert display.steps == [STEPS * (i + 1) for i in range(ITERATIONS)]
+        assert [row["env_steps"] for row in display.rows] == [24, 40, 64, 80, 104]
+    assert len({tuple(display.losses) for display in displays}) == len(SEEDS)
+
+
+def test_stopped_side_by_side_they_go_on_alone_and_together(tmp_path: Path, each_alone: Path) -> None:
+    """After a signal all stand at the same step; each of them is an ordinary run."""
+    with (
+        pytest.raises(Interrupted, match=rf"in each of {tmp_path}/seed5 to {tmp_path}/seed7, --resume"),
+        loop_of_all(tmp_path, [Recorder(), Recorder(5, stop), Recorder()]) as it,
+    ):
+        it.train(it.restore())
+    stopped = [checkpoint.steps(tmp_path / f"seed{seed}" / "checkpoints") for seed in SEEDS]
+    assert stopped == [stopped[0]] * len(SEEDS)
+    shutil.copytree(tmp_path, tmp_path / "copy")
+    for seed in SEEDS:
+        train_one(tmp_path / "copy" / f"seed{seed}", seed, resume=True)
+    assert_as_alone(tmp_path / "copy", each_alone)
+    with loop_of_all(tmp_path, [Recorder() for _ in SEEDS], resume=True) as it:
+        it.train(it.restore(stopped[0][-1]))
+    assert_as_alone(tmp_path, each_alone)
+
+
+def test_killed_between_their_checkpoints_they_go_on_from_the_last_that_all_have(
+    tmp_path: Path, each_alone: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save, killed = checkpoint.save, []
+
+    def second_of_the_last(folder: Path, step: int, *args: Any, **kwargs: Any) -> Path:
+        if step == 48 and "seed6" in str(folder):
+            killed.append(step)
+            raise RuntimeError("killed")
+        return save(folder, step, *args, **kwargs)
+
+    monkeypatch.setattr(checkpoint, "save", second_of_the_last)
+    with (
+        pytest.raises(RuntimeError, match="killed"),
+        loop_of_all(tmp_path, [Recorder() for _ in SEEDS], seconds=0) as it,
+    ):
+        it.train(it.restore())
+    monkeypatch.undo()
+    newest = [checkpoint.steps(tmp_path / f"seed{seed}" / "checkpoints")[-1] for seed in SEEDS]
+    assert newest == [48, 40, 40]
+    with loop_of_all(tmp_path, [Recorder() for _ in SEEDS], resume=True) as it:
+        state = it.restore(40)
+        assert it.position.done == 5
+        it.train(state)
+    assert_as_alone(tmp_path, each_alone)
+
+
+def test_one_of_them_that_diverges_is_named(tmp_path: Path) -> None:
+    """All stop: the others have been saved until then."""
+    with loop_of_all(tmp_path, [Recorder() for _ in SEEDS], seconds=0) as it:
+        iterate = it._iterate
+
+        def poisoned(states: Any, index: int) -> Any:
+            states, metrics = iterate(states, index)
+            if index == 6:
+                states[1]["params"] = states[1]["params"] * jnp.nan
+            return states, metrics
+
+        it._iterate = poisoned
+        with pytest.raises(DivergedError, match=r"step 56; the last checkpoint, in .*seed6, is of step 48; try"):
+            it.train(it.restore())

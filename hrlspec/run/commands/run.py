@@ -6,6 +6,8 @@ input, 130 interrupted with a checkpoint written.
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -16,8 +18,6 @@ import jax
 from hrlspec.agent.low_level import Params
 from hrlspec.agent_files import AgentFile
 from hrlspec.evaluation import SuiteResult, aggregate
-from hrlspec.learning.shards import most_devices, num_devices
-from hrlspec.run import platform
 from hrlspec.run.configuration import differences
 from hrlspec.run.console import PlainConsole, result_console
 from hrlspec.run.errors import UserError
@@ -35,12 +35,15 @@ from hrlspec.run.folder import (
 )
 from hrlspec.run.hosts import Hosts, joined
 from hrlspec.run.learner import Learner, on_one_device
+from hrlspec.run.learners import together
 from hrlspec.run.live_curves import CURVES, LiveCurves, draw_curves
-from hrlspec.run.loop import DivergedError, Loop, UnsavedError
-from hrlspec.run.progress import ProgressDisplay, duration
+from hrlspec.run.loop import Loop
+from hrlspec.run.progress import MeanDisplay, ProgressDisplay, duration
 from hrlspec.run.run_flags import RunFlags, experiments_of, parse_run, schedules_moved
 from hrlspec.run.signals import ended_by_signals
+from hrlspec.run.spread import Spread, spread
 from hrlspec.run.tables import aggregate_table, final_tables
+from hrlspec.run.track import DivergedError, Track, UnsavedError
 from hrlspec.run.trained import find_file, load_file
 from hrlspec.run.unseen import with_tasks
 
@@ -66,19 +69,25 @@ def main(argv: Sequence[str], *, program: str = "hrlspec run") -> None:
 
 
 def _run_all(runs: Sequence[tuple[Experiment, Path]], given: AgentFile | None, flags: RunFlags, hosts: Hosts) -> None:
-    """One run after the other, and what they have in common."""
+    """All runs, one after another or side by side, and what they have in common."""
     resumed = hosts.lead(lambda: _check_folders(runs, flags))
-    devices = _devices(flags, runs[0][0].config.blocks, hosts)
+    summaries: list[Any] = hosts.lead(
+        lambda: [_results(*run) if resume else None for run, resume in zip(runs, resumed, strict=True)]
+    )
+    left = [number for number, summary in enumerate(summaries) if summary is None]
+    how = spread(flags, runs[0][0].config.blocks, [runs[number][1] for number in left], hosts)
     params = None if given is None else load_file(given)
     console = result_console()
-    summaries = [
-        _run(experiment, folder, resume, devices, params, flags, console, hosts)
-        for (experiment, folder), resume in zip(runs, resumed, strict=True)
-    ]
+    for (_, folder), summary in zip(runs, summaries, strict=True):
+        if summary is not None:
+            console.say(f"{folder} is finished; its results are in summary.json")
+    for numbers in [left] if how.side_by_side else [[number] for number in left]:
+        begun = [(*runs[number], resumed[number]) for number in numbers]
+        for number, summary in zip(numbers, _run(begun, how, params, flags, console, hosts), strict=True):
+            summaries[number] = summary
     if len(summaries) > 1:
         results = [SuiteResult.from_json(summary["final"]["suite"]) for summary in summaries]
-        name = runs[0][0].name.rpartition("-")[0]
-        console.print(aggregate_table(f"{name}, seeds {flags.seed} to {runs[-1][0].seed}", aggregate(results)))
+        console.print(aggregate_table(_name([experiment for experiment, _ in runs]), aggregate(results)))
 
 
 def check_beginning(flags: RunFlags, experiment: Experiment) -> AgentFile | None:
@@ -88,14 +97,16 @@ def check_beginning(flags: RunFlags, experiment: Experiment) -> AgentFile | None
         The agent that training begins from, if one is named.
 
     Raises:
-        UserError: a library is missing, devices do not share the blocks, or the agent does not fit.
+        UserError: a library is missing, devices do not share blocks or seeds, or the agent does not fit.
         AgentFileError: the agent cannot be used.
     """
     if flags.wandb is not None:
         check_wandb()
-    blocks = experiment.config.blocks
-    if flags.devices != "auto" and blocks % flags.devices:
-        raise UserError(f"--devices is {flags.devices}, expected a divisor of {blocks}, the number of --config.blocks")
+    shared, what = experiment.config.blocks, "--config.blocks"
+    if flags.parallel_seeds:
+        shared, what = flags.num_seeds, "seeds"
+    if flags.devices != "auto" and shared % flags.devices:
+        raise UserError(f"--devices is {flags.devices}, expected a divisor of {shared}, the number of {what}")
     return None if flags.from_ is None else _file_that_fits(flags.from_, experiment)
 
 
@@ -123,25 +134,6 @@ def _file_that_fits(name: str, experiment: Experiment) -> AgentFile:
         if setting in ("env", "method") or re.match(r"(config|method_settings\..*)\.network\.", setting):
             raise UserError(f"--from {name} has {setting} = {there!r}, not {here!r}: train on with what it has")
     return file
-
-
-def _devices(flags: RunFlags, blocks: int, hosts: Hosts) -> int:
-    """Prepares JAX and says how many devices a run is spread over, as many of each process."""
-    automatic, count = flags.devices == "auto", hosts.count
-    if blocks % count:
-        raise UserError(f"--config.blocks is {blocks}, expected a multiple of {count}, the number of processes")
-    wanted = hosts.lead(lambda: most_devices(blocks // count, len(platform.cores())) * count)
-    if not automatic:
-        wanted = int(flags.devices)
-    if wanted % count:
-        raise UserError(f"--devices is {wanted}, expected a multiple of {count}, the number of processes")
-    platform.prepare(host_devices=wanted // count)
-    available = num_devices()
-    if automatic:
-        return most_devices(blocks // count, available // count) * count
-    if wanted > available:
-        raise UserError(f"--devices is {wanted}, but JAX has {available} ({jax.default_backend()})")
-    return wanted
 
 
 def _check_folders(runs: Sequence[tuple[Experiment, Path]], flags: RunFlags) -> list[bool]:
@@ -183,50 +175,78 @@ def _results(experiment: Experiment, folder: Path) -> dict[str, Any] | None:
 
 
 def _run(
-    experiment: Experiment,
-    folder: Path,
-    resume: bool,
-    devices: int,
+    runs: Sequence[tuple[Experiment, Path, bool]],
+    how: Spread,
     params: Params | None,
     flags: RunFlags,
     console: PlainConsole,
     hosts: Hosts,
-) -> dict[str, Any]:
-    """One run from its beginning, or from where it was left, to its summary."""
-    summary = hosts.lead(lambda: _results(experiment, folder) if resume else None)
-    if summary is not None:
-        console.say(f"{folder} is finished; its results are in summary.json")
-        return summary
-    before = experiment_of(read_record(folder)["config"], str(folder)) if resume else experiment
-    preset = with_tasks(experiment.preset, folder, experiment.seed)
-    learner = Learner(experiment, preset, devices, params)
-    with (
-        open_run(folder, experiment, resume=resume, may_change=_may_change(flags), wandb=flags.wandb)
-        if hosts.leads
-        else followed_run(folder, experiment, resume=resume) as run
-    ):
+) -> list[dict[str, Any]]:
+    """A run, or several side by side, from their beginning, or from where they were left, to their summaries."""
+    experiments = [experiment for experiment, _, _ in runs]
+    first, folder, resume = runs[0]
+    before = experiment_of(read_record(folder)["config"], str(folder)) if resume else first
+    learners = _learners(runs, 1 if how.side_by_side else how.devices, params)
+    with contextlib.ExitStack() as stack:
+        folders = [stack.enter_context(_opened(*run, flags, hosts)) for run in runs]
         if hosts.leads:
-            # Suite dag comes last: where it is there all are.
-            for name, text in sorted(preset.texts.items(), reverse=True):
-                run.write_tasks(name, text)
-        hosts.meet(learner.trainer.shards.mesh)
-        job = learner.job()
-        total = job.num_iterations * job.steps_per_iteration
-        with ProgressDisplay(total, experiment.name) as display:
-            watched = LiveCurves(display, run, experiment.name)
-            loop = Loop(job, run, watched, checkpoint_seconds=60 * flags.checkpoint_minutes, hosts=hosts)
-            state = loop.restore()
+            for learner, run in zip(learners, folders, strict=True):
+                # Suite dag comes last: where it is there all are.
+                for name, text in sorted(learner.preset.texts.items(), reverse=True):
+                    run.write_tasks(name, text)
+        hosts.meet(learners[0].trainer.shards.mesh)
+        jobs = [learner.job() for learner in learners]
+        total, name = jobs[0].num_iterations * jobs[0].steps_per_iteration, _name(experiments)
+        with ProgressDisplay(total, name) as display:
+            shown = MeanDisplay(display, len(runs)) if how.side_by_side else display
+            curves = [
+                LiveCurves(shown, run, one.name, len(runs)) for one, run in zip(experiments, folders, strict=True)
+            ]
+            loop = Loop(
+                [Track(*parts) for parts in zip(jobs, folders, curves, strict=True)],
+                together(learners, how.devices) if how.side_by_side else None,
+                checkpoint_seconds=60 * flags.checkpoint_minutes,
+                hosts=hosts,
+            )
+            state = loop.restore(how.step)
             if loop.position.done:
-                display.note(_continuing(experiment, before, loop.position.done))
+                display.note(_continuing(first, before, loop.position.done))
             try:
                 state = loop.train(state)
             except (DivergedError, UnsavedError) as error:
                 raise SystemExit(f"error: {error}") from None
         wall = loop.position.wall
-        console.say(f"{experiment.name}: trained in {duration(wall)}; evaluating")
-        with ended_by_signals(f"during the final evaluation; training is saved in {folder}, --resume ends it"):
-            params = on_one_device(state.params)
-            return hosts.lead(lambda: _finish(learner, run, params, total, wall, console))
+        console.say(f"{name}: trained in {duration(wall)}; evaluating")
+        with ended_by_signals(f"during the final evaluation; training is saved in {loop.where}, --resume ends it"):
+            summaries = []
+            for learner, run, part in zip(learners, folders, loop.parts(state), strict=True):
+                finish = functools.partial(_finish, learner, run, on_one_device(part.params), total, wall, console)
+                summaries.append(hosts.lead(finish))
+            return summaries
+
+
+def _learners(runs: Sequence[tuple[Experiment, Path, bool]], devices: int, params: Params | None) -> list[Learner]:
+    """One for each run, with the same programs."""
+    presets = [with_tasks(experiment.preset, folder, experiment.seed) for experiment, folder, _ in runs]
+    first = Learner(runs[0][0], presets[0], devices, params)
+    return [first, *(first.beside(run[0], preset) for run, preset in zip(runs[1:], presets[1:], strict=True))]
+
+
+def _opened(
+    experiment: Experiment, folder: Path, resume: bool, flags: RunFlags, hosts: Hosts
+) -> contextlib.AbstractContextManager[RunFolder]:
+    """The folder of a run, to write to on the first process alone."""
+    if not hosts.leads:
+        return followed_run(folder, experiment, resume=resume)
+    return open_run(folder, experiment, resume=resume, may_change=_may_change(flags), wandb=flags.wandb)
+
+
+def _name(experiments: Sequence[Experiment]) -> str:
+    """What one or several that differ in their seeds are called."""
+    first, last = experiments[0], experiments[-1]
+    if len(experiments) == 1:
+        return first.name
+    return f"{first.name.rpartition('-')[0]}, seeds {first.seed} to {last.seed}"
 
 
 def _continuing(experiment: Experiment, before: Experiment, done: int) -> str:
