@@ -34,7 +34,7 @@ class Spread:
 def spread(flags: RunFlags, blocks: int, folders: Sequence[Path], hosts: Hosts) -> Spread:
     """Prepares JAX, and says how the runs in some folders are spread.
 
-    What was not asked for is done where it costs less (``benchmarks/seeds.py``): on a CPU seeds train side by side where
+    What was not asked for is done where it costs less (``benchmarks/seeds.py``): on a CPU seeds train side by side if
     they share its cores evenly, and no fewer of them than one run alone would use. An accelerator has room for all of
     them at once; nothing was measured on one.
 
