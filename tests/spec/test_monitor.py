@@ -41,7 +41,7 @@ from hrlspec.spec import (
 )
 from tests.spec.tasks import NAMES, conditions, formulas, nesting, random_formula
 
-NUM_FORMULAS, NUM_TRACES, LENGTH, MAX_NODES = 1500, 70, 12, 24
+NUM_TRACES, LENGTH, MAX_NODES = 70, 12, 24
 
 
 class Pairs(NamedTuple):
@@ -61,24 +61,25 @@ class Run(NamedTuple):
     blocked: np.ndarray  # bool [F, R, T, N]
 
 
-@pytest.fixture(scope="module")
-def pairs() -> Pairs:
+@pytest.fixture(scope="module", params=[200, pytest.param(1500, marks=pytest.mark.slow)])
+def pairs(request: pytest.FixtureRequest) -> Pairs:
+    """As many formulas as the parameter says."""
     rng = np.random.default_rng(7)
     kept: list[Formula] = []
     trees: list[TaskTree] = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SpecWarning)
-        while len(kept) < NUM_FORMULAS:
+        while len(kept) < request.param:
             formula = random_formula(rng, 5)
             if nesting(formula) < 3:
                 continue
             try:
-                trees.append(jax.device_get(compile_task(formula, NAMES, MAX_NODES)))
+                trees.append(compile_task(formula, NAMES, MAX_NODES, on_host=True))
             except SpecError:
                 continue  # too large, or forbids what it has to reach
             kept.append(formula)
-    density = rng.uniform(0.05, 0.4, size=(NUM_FORMULAS, NUM_TRACES, 1, 1))
-    labels = rng.random((NUM_FORMULAS, NUM_TRACES, LENGTH, len(NAMES))) < density
+    density = rng.uniform(0.05, 0.4, size=(len(kept), NUM_TRACES, 1, 1))
+    labels = rng.random((len(kept), NUM_TRACES, LENGTH, len(NAMES))) < density
     assigned = rng.integers(-1, 10, size=labels.shape[:3]).astype(np.int32)
     return Pairs(kept, jax.tree.map(lambda *x: np.stack(x), *trees), labels, assigned)
 
@@ -98,14 +99,14 @@ def run(pairs: Pairs) -> Run:
 
 def test_pairs_are_many_and_varied(pairs: Pairs, run: Run) -> None:
     final = run.status[..., -1]
-    assert final.size >= 100_000
+    assert final.size >= 14_000
     assert (final == SATISFIED).mean() >= 0.2
     assert (final == VIOLATED).mean() >= 0.2
     assert (final == RUNNING).mean() >= 0.02
     assert min(map(nesting, pairs.formulas)) >= 3
     assert (pairs.labels.sum(-1) > 1).mean() >= 0.2
     assert run.blocked[..., :-1, :].any(-1)[run.status[..., :-1] == RUNNING].mean() >= 0.05
-    assert len(set(pairs.formulas)) >= 0.9 * NUM_FORMULAS
+    assert len(set(pairs.formulas)) >= 0.9 * len(pairs.formulas)
 
 
 class Edge(NamedTuple):
@@ -151,7 +152,7 @@ def test_monitor_equals_the_rules(pairs: Pairs, run: Run) -> None:
     powers = 1 << np.arange(MAX_NODES, dtype=np.int64)
     blocked = (run.blocked @ powers).tolist()
     node, status, assigned = run.node.tolist(), run.status.tolist(), pairs.assigned.tolist()
-    for f in range(NUM_FORMULAS):
+    for f in range(len(pairs.formulas)):
         tree = jax.tree.map(lambda x, f=f: x[f], pairs.trees)
         for r in range(NUM_TRACES):
             expected = [
@@ -267,7 +268,7 @@ def _traces(max_size: int) -> st.SearchStrategy[list[frozenset[str]]]:
     return st.lists(st.frozensets(st.sampled_from(NAMES[:3])), max_size=max_size)
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(formulas(NAMES[:3]), _traces(6))
 def test_exact_semantics_are_the_four_rules(formula: Formula, trace: list[frozenset[str]]) -> None:
     steps = tuple(trace)
