@@ -35,6 +35,8 @@ from tests.probes import (
     small_config,
     small_planner,
 )
+from tests.test_api import CONFIG as API_CONFIG
+from tests.test_api import HELD_OUT
 
 # a at 0, b at 4, c at 5; episodes start at 1, 2 or 3.
 ENV = Corridor()
@@ -43,10 +45,11 @@ CONFIG = small_config(
     network=dataclasses.replace(small_config().network, latent=32, encoder_mlp=(64,), critic=(64,), actor=(64,)),
 )
 TRAINER = Trainer(small_agent(ENV, CONFIG, network__hidden=32, network__features=32))
+QUICK = Trainer(small_agent(ENV, API_CONFIG))
+"""For what does not depend on how much is learned: the same program as the API's tests train with."""
 GAMMA = CONFIG.discount
 TASKS = ("a or b", "b or a", "achieve a", "a ensuring not b", "(a or b); c", "a; b", "a or b")
-ITERATIONS = CONFIG.num_iterations
-NOTHING_RESERVED = np.zeros(1, np.uint32)
+NOTHING_RESERVED = np.zeros(len(HELD_OUT), np.uint32)
 
 
 def task(name: str) -> TaskTree:
@@ -64,24 +67,23 @@ def machine(completion: float = 1.0) -> RewardMachine:
     return reward_machine(ENV.propositions, completion=completion)
 
 
-def fresh(seed: int = 0) -> TrainState:
-    return init(jax.random.key(seed), bank(), machine())
+def fresh(seed: int = 0, trainer: Trainer = QUICK) -> TrainState:
+    return trainer.init(jax.random.key(seed), bank(), machine())
 
 
-init, step = quick_jit(TRAINER.init), quick_jit(TRAINER.iterate)
-
-
-def iterate(state: TrainState, times: int, completion: float = 1.0) -> tuple[TrainState, list[dict[str, float]]]:
-    history = []
+def iterate(
+    state: TrainState, times: int, completion: float = 1.0, trainer: Trainer = QUICK
+) -> tuple[TrainState, list[dict[str, float]]]:
+    state, history = jax.tree.map(jnp.copy, state), []  # which an iteration uses up
     for _ in range(times):
-        state, metrics = step(state, bank(), machine(completion), NOTHING_RESERVED)
+        state, metrics = trainer.iterate(state, bank(), machine(completion), NOTHING_RESERVED)
         history.append(metrics)
     return state, [{name: float(value) for name, value in metrics.items()} for metrics in history]
 
 
 @functools.cache
 def trained() -> tuple[TrainState, list[dict[str, float]]]:
-    return iterate(fresh(), ITERATIONS)
+    return iterate(fresh(trainer=TRAINER), CONFIG.num_iterations, trainer=TRAINER)
 
 
 # --- One iteration ---
@@ -99,25 +101,12 @@ def test_training_goes_on_from_a_checkpoint_as_if_nothing_had_happened(tmp_path:
     straight, _ = iterate(fresh(), 4)
     half, _ = iterate(fresh(), 2)
     checkpoint.save(tmp_path, 2, half)
-    target = jax.eval_shape(TRAINER.init, jax.random.key(9), bank(), machine())
+    target = jax.eval_shape(QUICK.init, jax.random.key(9), bank(), machine())
     restored = checkpoint.load(tmp_path, target).state
-    traces = step._cache_size()
+    traces = Trainer.iterate._cache_size()
     resumed, _ = iterate(restored, 2)
     assert state_hash(resumed) == state_hash(straight)
-    assert step._cache_size() == traces
-
-
-def test_nothing_compiles_again_across_levels() -> None:
-    state, _ = iterate(fresh(), 1)
-    traces = step._cache_size()
-    ready = state.curriculum.replace(finished=jnp.int32(10_000), succeeded=jnp.int32(10_000))
-    state, _ = iterate(state.replace(curriculum=ready), 1)
-    assert int(state.curriculum.level) == 1
-    state, history = iterate(state, 2)
-    assert history[-1]["level"] == 2
-    # The tasks of the new level have come in.
-    assert np.asarray(state.tasks.depth).max() == 2
-    assert step._cache_size() == traces
+    assert Trainer.iterate._cache_size() == traces
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
