@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -25,15 +24,17 @@ NAMES = LETTER.propositions
 COMPLETION = reward_machine(NAMES)
 WALKER = walker(LETTER)
 KEY = jax.random.key(0)
+MAX_NODES, COUNT = 16, 24
+"""Sizes of trees and numbers of layouts that tests share, and with them the compiled programs."""
 
 
-def tasks(*texts: str, max_nodes: int = 8) -> Automata:
+def tasks(*texts: str) -> Automata:
     labels = [frozenset(), *(frozenset({name}) for name in NAMES)]
-    return automata_of([to_automaton(parse_ltl(text), NAMES, labels) for text in texts], NAMES, max_nodes)[0]
+    return automata_of([to_automaton(parse_ltl(text), NAMES, labels) for text in texts], NAMES, MAX_NODES)[0]
 
 
-def layouts(count: int, seed: int = 0) -> np.ndarray:
-    keys = jax.random.split(jax.random.key(seed), count)
+def layouts(seed: int = 0) -> np.ndarray:
+    keys = jax.random.split(jax.random.key(seed), COUNT)
     return np.asarray(jax.vmap(LETTER.sample_layout, (0, None))(keys, LETTER.default_params))
 
 
@@ -45,18 +46,17 @@ def test_step_for_step_as_on_the_tree(last: bool) -> None:
         "achieve a or achieve c": "F (a | c)",
         "achieve b ensuring not a": "!a U b",
     }
-    some = layouts(12)
-    for text, ltl in twins.items():
-        tree = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 12), compile_task(parse(text), NAMES, 8))
-        on_tree, trace = trace_episodes(KEY, WALKER, manner(last=last), COMPLETION, tree, some, greedy=True)
-        which = np.zeros(12, int)
-        other = trace_episodes(KEY, WALKER, manner(last=last), COMPLETION, tasks(ltl), some, which=which, greedy=True)
-        on_automaton, other_trace = other
-        jax.tree.map(np.testing.assert_array_equal, on_tree, on_automaton)
-        np.testing.assert_array_equal(trace.running, other_trace.running)
-        places = (np.asarray(some.env_state.position)[np.asarray(some.running)] for some in (trace, other_trace))
-        np.testing.assert_array_equal(*places)
-        assert np.asarray(on_tree.success).all()
+    some, which, how = layouts(), np.arange(COUNT) % len(twins), {"greedy": True}
+    each = [compile_task(parse(text), NAMES, MAX_NODES, on_host=True) for text in twins]
+    trees = jax.tree.map(lambda *x: np.stack([x[i] for i in which]), *each)
+    on_trees, trace = trace_episodes(KEY, WALKER, manner(last=last), COMPLETION, trees, some, **how)
+    together = tasks(*twins.values())
+    on_automata, other = trace_episodes(KEY, WALKER, manner(last=last), COMPLETION, together, some, which=which, **how)
+    jax.tree.map(np.testing.assert_array_equal, on_trees, on_automata)
+    np.testing.assert_array_equal(trace.running, other.running)
+    places = (np.asarray(one.env_state.position)[np.asarray(one.running)] for one in (trace, other))
+    np.testing.assert_array_equal(*places)
+    assert np.asarray(on_trees.success).all()
 
 
 @pytest.mark.parametrize("last", [False, True])
@@ -68,12 +68,11 @@ def test_a_tree_as_an_automaton_is_carried_out_step_for_step_as_the_tree(last: b
         "(achieve a or achieve b or achieve c) ensuring not d; (achieve a or achieve e) ensuring not c",
         "achieve e or (achieve a; achieve b or achieve c; achieve d)",
     )
-    count = 6 * len(texts)
-    trees = [compile_task(parse(text), NAMES, 16, on_host=True) for text in texts]
+    trees = [compile_task(parse(text), NAMES, MAX_NODES, on_host=True) for text in texts]
     each = [monitor_automaton(tree, NAMES, LETTER.possible_labels) for tree in trees]
     shown = [trees for _, trees in each]
-    together, *_ = automata_of([automaton for automaton, _ in each], NAMES, 16, trees=shown)
-    some, which = layouts(count, seed=11), np.arange(count) % len(texts)
+    together, *_ = automata_of([automaton for automaton, _ in each], NAMES, MAX_NODES, trees=shown)
+    some, which = layouts(seed=11), np.arange(COUNT) % len(texts)
     stacked = jax.tree.map(lambda *x: np.stack([x[i] for i in which]), *trees)
     how = {"greedy": True}
     on_trees, trace = trace_episodes(KEY, WALKER, manner(last=last), COMPLETION, stacked, some, **how)
@@ -90,7 +89,7 @@ def test_a_task_that_no_tree_can_say_is_carried_out_in_its_exact_reading() -> No
     text = "achieve a; ((achieve b; achieve d) ensuring not c)"
     suite = exact_suite("some", f"{text}\nachieve a ensuring not a", LETTER)
     assert suite.num_states.tolist() == [4, 1]
-    found = evaluate_ltl(KEY, WALKER, manner(), COMPLETION, suite, episodes=40, greedy=True)
+    found = evaluate_ltl(KEY, WALKER, manner(), COMPLETION, suite, episodes=40, greedy=True, chunk=COUNT)
     assert [score.success_rate.estimate for score in found.per_formula] == [1, 0]
     assert found.per_formula[0].formula == text
     with pytest.raises(SpecError, match="some, line 2, column 9: found ';'"):
@@ -100,13 +99,13 @@ def test_a_task_that_no_tree_can_say_is_carried_out_in_its_exact_reading() -> No
 def test_a_second_try() -> None:
     """No tree says this: c before d withdraws b, and an agent that steps on c must go for b again."""
     text = "!a U (b & (!c U d))"
-    some = layouts(64, seed=3)
-    which = np.zeros(64, int)
+    some = layouts(seed=3)
+    which = np.zeros(COUNT, int)
     episodes, trace = trace_episodes(KEY, WALKER, manner(), COMPLETION, tasks(text), some, which=which, greedy=True)
     assert np.asarray(episodes.success).mean() > 0.9
     states = trace.env_state
     labels = np.asarray(jax.vmap(jax.vmap(lambda state: LETTER.labels(state, LETTER.default_params)))(states))
-    for episode in range(64):
+    for episode in range(COUNT):
         steps = int(episodes.steps[episode])
         # Entry t is the state before step t: entry 1 has the labels after the first action; the last are not there.
         seen = [{name for name, holds in zip(NAMES, labels[t, episode], strict=True) if holds} for t in range(1, steps)]
@@ -118,38 +117,36 @@ def test_a_second_try() -> None:
 def test_tasks_of_any_size_in_one_program() -> None:
     """Which task an episode has, whose states are rows of one table, does not change how it goes."""
     texts = ("F (a & F b)", "F a & F b & F c", "!a U (b & (!c U d))")
-    together, some = tasks(*texts, max_nodes=16), layouts(9, seed=5)
+    together, some = tasks(*texts), layouts(seed=5)
     how = {"greedy": True}
-    mixed = run_episodes(KEY, WALKER, manner(), COMPLETION, together, some, which=np.arange(9) % 3, **how)
+    mixed = run_episodes(KEY, WALKER, manner(), COMPLETION, together, some, which=np.arange(COUNT) % 3, **how)
     for number, text in enumerate(texts):
-        alone = run_episodes(
-            KEY, WALKER, manner(), COMPLETION, tasks(text, max_nodes=16), some, which=np.zeros(9, int), **how
-        )
+        alone = run_episodes(KEY, WALKER, manner(), COMPLETION, tasks(text), some, which=np.zeros(COUNT, int), **how)
         for one, other in zip(jax.tree.leaves(mixed), jax.tree.leaves(alone), strict=True):
             np.testing.assert_array_equal(one[number::3], other[number::3])
     with pytest.raises(ValueError, match="which names task 3, there are 3"):
-        run_episodes(KEY, WALKER, manner(), COMPLETION, together, some, which=np.full(9, 3), **how)
-    with pytest.raises(ValueError, match="found 3 tasks for 9 layouts, expected one for each"):
+        run_episodes(KEY, WALKER, manner(), COMPLETION, together, some, which=np.full(COUNT, 3), **how)
+    with pytest.raises(ValueError, match="found 3 tasks for 24 layouts, expected one for each"):
         run_episodes(KEY, WALKER, manner(), COMPLETION, together, some, **how)
 
 
 def test_rounds_of_a_task_that_goes_on() -> None:
     """a, then b, then a again: counted from what the agent stepped on. It ends with the horizon, satisfied or not."""
     suite = ltl_suite("some", "GF a & GF b", LETTER, forever=True)
-    some = layouts(16, seed=7)
-    which = np.zeros(16, int)
+    some = layouts(seed=7)
+    which = np.zeros(COUNT, int)
     episodes, trace = trace_episodes(KEY, WALKER, manner(), COMPLETION, suite.automata, some, which=which, greedy=True)
     labels = np.asarray(jax.vmap(jax.vmap(lambda state: LETTER.labels(state, LETTER.default_params)))(trace.env_state))
-    assert np.asarray(episodes.steps).tolist() == [LETTER.horizon] * 16
+    assert np.asarray(episodes.steps).tolist() == [LETTER.horizon] * COUNT
     assert not np.asarray(episodes.success).any()
-    for episode in range(16):
+    for episode in range(COUNT):
         wanted, rounds = 0, 0
         for step in range(1, LETTER.horizon):  # what the last step led to is not in the trace
             if labels[step, episode, wanted]:
                 wanted, rounds = 1 - wanted, rounds + wanted
         assert int(episodes.rounds[episode]) - rounds in (0, 1)
         assert rounds > 3
-    found = evaluate_ltl(KEY, WALKER, manner(), COMPLETION, suite, episodes=16, greedy=True)
+    found = evaluate_ltl(KEY, WALKER, manner(), COMPLETION, suite, episodes=COUNT, greedy=True)
     assert found.to_json()["rounds_mean"] == found.rounds_mean > 3
 
 
@@ -165,7 +162,7 @@ def test_a_suite_of_formulas() -> None:
     assert found.per_formula[1].steps_mean.estimate == 1
     assert found.success_rate == pytest.approx(2 / 3)
     json.dumps(found.to_json(), allow_nan=False)
-    again = evaluate_ltl(KEY, WALKER, manner(), COMPLETION, suite, episodes=40, greedy=True, chunk=7)
+    again = evaluate_ltl(KEY, WALKER, manner(), COMPLETION, suite, episodes=40, greedy=True, chunk=COUNT)
     assert [score.success_rate for score in again.per_formula] == [score.success_rate for score in found.per_formula]
 
 
@@ -175,7 +172,7 @@ def test_another_formula_needs_no_compilation() -> None:
     assert len({int(suite.num_states[0]) for suite in suites}) == 3
     sizes = []
     for suite in suites:
-        evaluate_ltl(KEY, WALKER, manner(), COMPLETION, suite, episodes=3)
+        evaluate_ltl(KEY, WALKER, manner(), COMPLETION, suite, episodes=COUNT, greedy=True)
         sizes.append(_run._cache_size())
     assert sizes[0] == sizes[1] == sizes[2]
 
