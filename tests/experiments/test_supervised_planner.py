@@ -19,7 +19,7 @@ from hrlspec.config import evolve
 from hrlspec.methods import ImplicitPlanner
 from hrlspec.presets import preset
 from hrlspec.spec import initial, open_edges, task_hashes
-from tests.probes import quick_jit
+from tests.probes import quick_jit, random_params
 
 FLAGS = Flags(recipe="hrlspec", tasks=12, layouts=4, minibatch=8)
 
@@ -43,7 +43,7 @@ def test_the_loss_is_of_the_probability_of_a_best_edge() -> None:
     config, method = world.settings("ours", "hrlspec")
     agent = Agent(world.make(), config, evolve(method, {"high.network.advice": 0.0}))
     samples = jax.tree.map(lambda x: x[:3], draw(world, FLAGS, 0)[0])
-    params = agent.init(jax.random.key(0))["high"]
+    params = random_params(agent, 0)["high"]
     planner = cast(ImplicitPlanner, agent.high).planner(agent.low)
 
     @quick_jit
