@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import runpy
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -61,11 +63,20 @@ def test_sub_commands_call_themselves_by_their_name(
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_so_do_the_modules(name: str) -> None:
-    command = [sys.executable, "-m", f"experiments.{name}", "--no-such-flag"]
-    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
-    assert (ended.returncode, ended.stdout) == (2, "")
-    assert ended.stderr.endswith(f"(see python -m experiments.{name} --help)\n")
+def test_so_do_the_modules(name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(sys, "argv", [name, "--no-such-flag"])
+    monkeypatch.delitem(sys.modules, f"experiments.{name}", raising=False)  # else there is a warning
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        with pytest.raises(SystemExit) as stop:
+            runpy.run_module(f"experiments.{name}", run_name="__main__")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert stop.value.code == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.endswith(f"(see python -m experiments.{name} --help)\n")
 
 
 def test_reproduce_needs_a_checkout(
