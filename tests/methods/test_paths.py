@@ -12,10 +12,11 @@ import pytest
 
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.distributions import MASKED
-from hrlspec.agent.experience import Credit, HighBatch, undecided
+from hrlspec.agent.experience import Credit, HighBatch, View, undecided
+from hrlspec.agent.high_level import Choice
+from hrlspec.agent.networks.controller import Instruction
 from hrlspec.config import evolve
 from hrlspec.methods import Ours
-from hrlspec.methods.ours import ImplicitPlanner
 from hrlspec.methods.paths import Paths, best_of_edges, open_paths, sequence
 from hrlspec.spec import TaskState, TaskTree, initial, open_edges, subtask_avoid
 from tests.probes import Corridor, on_device, quick_jit, random_params, small_config, small_planner
@@ -28,6 +29,28 @@ NO_NODE = TaskTree.NO_NODE
 
 def planner_agent(**changes: Any) -> Agent:
     return Agent(ENV, small_config(), Ours(high=small_planner(values_paths=True, **changes)))
+
+
+@functools.partial(quick_jit, static_argnums=0)
+def choose(agent: Agent, params: Any, views: View, tree: TaskTree, state: TaskState) -> tuple[Choice, Instruction]:
+    """What is chosen of one task in some views, and the low level's instructions."""
+    each = jax.tree.map(lambda x: jnp.stack([x] * len(views[1])), (tree, state, agent.low.instruct(params, tree)))
+    return agent.high.choose(agent.low, params, views, *each), each[2]
+
+
+@functools.partial(quick_jit, static_argnums=0)
+def worth(agent: Agent, params: Any, views: View, path: jax.Array) -> jax.Array:
+    """What a path from the root of `TREE` is worth in some views."""
+    planner = agent.high.planner(agent.low)  # type: ignore[attr-defined]
+    task = sequence(on_device(TREE), jnp.int32(0), path)
+    ask = jax.vmap(functools.partial(planner.apply, method="worth_of_view"), in_axes=(None, 0, None))
+    return ask(params["high"], views, task)
+
+
+def worth_by_leaf(agent: Agent, params: Any, views: View) -> dict[int, np.ndarray]:
+    """Of every path, each asked for by itself."""
+    paths = {path[-1]: jnp.array((path + [NO_NODE] * 4)[:4], jnp.int32) for path in paths_below(TREE, 0)}
+    return {leaf: np.asarray(worth(agent, params, views, path)) for leaf, path in paths.items()}
 
 
 def paths_below(tree: TaskTree, node: int) -> list[list[int]]:
@@ -87,22 +110,9 @@ def test_an_edge_is_worth_its_best_path() -> None:
 @pytest.mark.parametrize("rounds", [0, 4])
 def test_the_choice_follows_the_values_of_paths_asked_one_by_one(rounds: int) -> None:
     agent = planner_agent(network__rounds=rounds, inverse_temperature=3.0)
-    high, params = agent.high, random_params(agent, 0)
-    assert isinstance(high, ImplicitPlanner)
-    planner, tree = high.planner(agent.low), on_device(TREE)
-    views = ENV.view_at(np.array([1, 2]))
-
-    @quick_jit
-    def worth(path: Any) -> Any:
-        task = sequence(tree, jnp.int32(0), path)
-        ask = jax.vmap(functools.partial(planner.apply, method="worth_of_view"), in_axes=(None, 0, None))
-        return ask(params["high"], views, task)
-
-    each = {
-        path[-1]: np.asarray(worth(jnp.array((path + [NO_NODE] * 4)[:4], jnp.int32))) for path in paths_below(TREE, 0)
-    }
-    alike = jax.tree.map(lambda x: jnp.stack([x] * 2), (tree, initial(tree), agent.low.instruct(params, tree)))
-    choice = jax.tree.map(np.asarray, quick_jit(high.choose, static_argnums=0)(agent.low, params, views, *alike))
+    params, tree, views = random_params(agent, 0), on_device(TREE), ENV.view_at(np.array([1, 2]))
+    each = worth_by_leaf(agent, params, views)
+    choice = jax.tree.map(np.asarray, choose(agent, params, views, tree, initial(tree))[0])
     of_first, of_second = np.maximum(each[3], each[4]), each[5]
     np.testing.assert_allclose(choice.value, np.maximum(of_first, of_second), rtol=1e-5)
     np.testing.assert_allclose(choice.logits[:, 1] - choice.logits[:, 2], 3.0 * (of_first - of_second), atol=1e-4)
@@ -118,20 +128,18 @@ def test_the_low_level_is_told_the_path_that_is_meant() -> None:
     assert agent.high.follows_plan
     params, tree = random_params(agent, 0), on_device(TREE)
     views = ENV.view_at(np.array([1, 2]))
-    alike = jax.tree.map(lambda x: jnp.stack([x] * 2), (tree, initial(tree), agent.low.instruct(params, tree)))
-    choice = jax.tree.map(np.asarray, quick_jit(agent.high.choose, static_argnums=0)(agent.low, params, views, *alike))
+    choice, instruction = jax.tree.map(np.asarray, choose(agent, params, views, tree, initial(tree)))
     for env in range(2):
         for edge, path in ((1, [1, int(choice.leaf[env, 1])]), (2, [2, 5])):
             expected = np.zeros((2, 4))
             expected[0] = np.asarray(TREE.reach)[path[1]]
             np.testing.assert_array_equal(choice.ahead[env, edge], expected)
-        np.testing.assert_array_equal(choice.ahead[env, 0], alike[2].ahead[env, 0])
+        np.testing.assert_array_equal(choice.ahead[env, 0], instruction.ahead[env, 0])
 
 
 def test_the_loss_is_the_error_of_the_path_that_was_meant() -> None:
     agent = planner_agent(transe=0.0)
     high, params = agent.high, random_params(agent, 1)
-    planner = high.planner(agent.low)  # type: ignore[attr-defined]
     tree, views = on_device(TREE), ENV.view_at(np.array([1, 2, 3]))
     alike = jax.tree.map(lambda x: jnp.stack([x] * 3), (tree, initial(tree)))
     leaves, targets = jnp.array([3, 5, 4], jnp.int32), jnp.array([0.5, -1.0, 2.0])
@@ -148,27 +156,17 @@ def test_the_loss_is_the_error_of_the_path_that_was_meant() -> None:
         completed=false,
     )
     loss, metrics = quick_jit(lambda p: high.loss(agent.low, p, batch, jnp.float32(0)))(params["high"])
-    paths = {path[-1]: path for path in paths_below(TREE, 0)}
-
-    def worth(row: int) -> float:
-        path = jnp.array((paths[int(leaves[row])] + [NO_NODE] * 5)[:5], jnp.int32)
-        task = sequence(tree, jnp.int32(0), path)
-        view = jax.tree.map(lambda x: x[row], views)
-        return float(planner.apply(params["high"], view, task, method="worth_of_view"))
-
-    error = np.mean([(worth(row) - float(targets[row])) ** 2 for row in (0, 1)])
+    each = worth_by_leaf(agent, params, views)
+    error = np.mean([(each[int(leaves[row])][row] - float(targets[row])) ** 2 for row in (0, 1)])
     np.testing.assert_allclose(metrics["value_loss"], error, rtol=1e-4)
     np.testing.assert_allclose(loss, high.ppo.value_coefficient * error, rtol=1e-4)  # type: ignore[union-attr]
 
 
 def test_blocked_edges_are_not_chosen() -> None:
-    agent = planner_agent()
-    params, tree = random_params(agent, 2), on_device(TREE)
+    agent = planner_agent(network__rounds=0, inverse_temperature=3.0)
+    tree, views = on_device(TREE), ENV.view_at(np.array([2, 3]))
     state = initial(tree)
     state = TaskState(state.node, state.blocked.at[1].set(True), state.status)
-    alike = jax.tree.map(lambda x: x[None], (ENV.view_at(np.array([2])), tree, state, agent.low.instruct(params, tree)))
-    view = jax.tree.map(lambda x: x[0], alike[0])
-    choice = quick_jit(agent.high.choose, static_argnums=0)(agent.low, params, view, *alike[1:])
-    assert (np.asarray(choice.logits[0]) > MASKED / 2).nonzero()[0].tolist() == np.flatnonzero(
-        np.asarray(open_edges(tree, state))
-    ).tolist()
+    choice, _ = choose(agent, random_params(agent, 2), views, tree, state)
+    for logits in np.asarray(choice.logits):
+        assert np.flatnonzero(logits > MASKED / 2).tolist() == np.flatnonzero(open_edges(tree, state)).tolist()
