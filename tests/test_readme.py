@@ -1,4 +1,4 @@
-"""The README's Python runs as it stands, but for the number of steps."""
+"""The README's Python runs as it stands, but that training is of few steps and of a smaller program."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from typing import Any
 import jax
 import pytest
 
+from tests.test_quickstart import SHORTER
+
 README = Path(__file__).parents[1] / "README.md"
 
 
 def blocks() -> tuple[str, str, str]:
-    """Training and evaluating with as few steps as there can be; the parts that training is made of; Gymnasium."""
+    """Training and evaluating, with one short iteration; the parts that training is made of; Gymnasium."""
     first, more, gymnasium = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
-    shorter, count = re.subn(r"total_steps=2_500_000", "total_steps=8_192", first)
+    shorter, count = re.subn(r"total_steps=2_500_000", f"total_steps=1_024, changes={SHORTER}", first)
     assert count == 1
     return shorter, more, gymnasium
 
