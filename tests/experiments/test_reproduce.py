@@ -14,6 +14,7 @@ import pytest
 
 import envs_jax
 from experiments import reproduce
+from experiments.paper import claims
 from experiments.paper.claims import (
     CLAIMS,
     family,
@@ -52,6 +53,13 @@ from tests.experiments.made import record
 from tests.run.tiny import TOTAL, arguments
 
 KEPT = Path(__file__).parents[2] / "results" / "paper"
+
+
+@pytest.fixture(autouse=True)
+def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tenth of the usual bootstrap samples, which are most of what a report takes."""
+    for name in ("stratified_bootstrap", "probability_of_improvement"):
+        monkeypatch.setattr(claims, name, functools.partial(getattr(claims, name), resamples=200))
 
 
 @functools.cache
