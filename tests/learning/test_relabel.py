@@ -24,7 +24,7 @@ from tests.trees import random_tree
 
 LETTERS = "abcde"
 RULES = [Bonus("a", "d", 5.0), Bonus("b", "e", 10.0, ("a",)), Bonus("c", "b", 2.0, ("d", "e"))]
-T, SLOTS, ROLLOUTS = 24, 6, 150
+T, SLOTS, ROLLOUTS, NUM_SAMPLED = 24, 6, 150, 500
 
 
 class Setting(NamedTuple):
@@ -69,12 +69,19 @@ def play(rng: np.random.Generator, conjunctions: bool) -> dict[str, np.ndarray]:
 def _task(rng: np.random.Generator, conjunctions: bool) -> TaskTree:
     if conjunctions:
         return random_tree(rng, num_nodes=8, num_propositions=5, most_together=2, distinct=True)
-    trees = sample_trees(rng, num_tasks=1, num_propositions=5, max_nodes=9, min_depth=1, max_depth=6, max_branching=3)
-    return jax.tree.map(lambda x: x[0], trees)
+    row = int(rng.integers(NUM_SAMPLED))
+    return jax.tree.map(lambda x: x[row], _sampled())
 
 
 @functools.cache
-def relabeller(setting: Setting) -> Any:
+def _sampled() -> TaskTree:
+    """Tasks drawn at once, which is quicker than one by one."""
+    sizes = {"num_propositions": 5, "max_nodes": 9, "min_depth": 1, "max_depth": 6, "max_branching": 3}
+    return sample_trees(np.random.default_rng(0), num_tasks=NUM_SAMPLED, **sizes)
+
+
+@functools.cache
+def relabeller(max_path: int, max_nodes: int) -> Any:
     def one(key: jax.Array, record: Record, reserved: jax.Array, branch: float) -> Relabelled:
         machine = reward_machine(LETTERS, subtask=0.5, bonuses=RULES)
         return relabel(
@@ -83,8 +90,8 @@ def relabeller(setting: Setting) -> Any:
             machine,
             reserved,
             num_slots=SLOTS,
-            max_path=setting.max_path,
-            max_nodes=setting.max_nodes,
+            max_path=max_path,
+            max_nodes=max_nodes,
             max_avoid=3,
             branch=branch,
         )
@@ -93,14 +100,19 @@ def relabeller(setting: Setting) -> Any:
 
 
 @functools.cache
+def played(seed: int, conjunctions: bool) -> Record:
+    rng = np.random.default_rng(seed)
+    rollouts = [play(rng, conjunctions) for _ in range(ROLLOUTS)]
+    return Record(**{name: np.stack([r[name] for r in rollouts]) for name in rollouts[0]})
+
+
+@functools.cache
 def relabelled(setting: Setting) -> tuple[Record, Relabelled]:
-    rng = np.random.default_rng(setting.max_nodes)
-    rollouts = [play(rng, setting.conjunctions) for _ in range(ROLLOUTS)]
-    record = Record(**{name: np.stack([r[name] for r in rollouts]) for name in rollouts[0]})
+    record = played(setting.max_nodes, setting.conjunctions)
     if setting.visited:
         record = jax.tree.map(np.asarray, quick_jit(jax.vmap(visits))(record))
     keys = jax.random.split(jax.random.key(setting.max_nodes), ROLLOUTS)
-    new = relabeller(setting)(keys, record, NOTHING_RESERVED, 0.7)
+    new = relabeller(setting.max_path, setting.max_nodes)(keys, record, NOTHING_RESERVED, 0.7)
     return record, jax.tree.map(np.asarray, new)
 
 
@@ -258,7 +270,7 @@ def test_reserved_tasks_are_never_produced() -> None:
     reserved = np.unique(list(hashes.values()))[::2].astype(np.uint32)[: len(NOTHING_RESERVED)]
     reserved = np.pad(reserved, (0, len(NOTHING_RESERVED) - len(reserved)), "edge")
     keys = jax.random.split(jax.random.key(setting.max_nodes), ROLLOUTS)
-    again = jax.tree.map(np.asarray, relabeller(setting)(keys, record, reserved, 0.7))
+    again = jax.tree.map(np.asarray, relabeller(setting.max_path, setting.max_nodes)(keys, record, reserved, 0.7))
     kept = 0
     for i, slot, steps in slots:
         if hashes[i, slot] in reserved:
@@ -299,7 +311,7 @@ def test_branch_probability(branch: int) -> None:
     slot = np.repeat(np.where(np.arange(T) < 4, 0, 1)[None], ROLLOUTS, 0)
     record = Record(slot=slot, labels=labels, edge_taken=labels.any(-1), reach=labels, avoid=labels & False)
     keys = jax.random.split(jax.random.key(0), ROLLOUTS)
-    new = relabeller(setting)(keys, record, NOTHING_RESERVED, float(branch))
+    new = relabeller(setting.max_path, setting.max_nodes)(keys, record, NOTHING_RESERVED, float(branch))
     parent = np.asarray(new.tree.parent)[:, 0]
     for node in (0, 1):
         np.testing.assert_array_equal((parent == node).sum(-1), 1 + branch)
@@ -324,10 +336,9 @@ def test_branch_lengths_fill_the_room() -> None:
 
 @pytest.mark.parametrize(("max_path", "max_nodes"), [(4, 5), (3, 6), (1, 2), (1, 3)])
 def test_little_or_no_room_for_branches(max_path: int, max_nodes: int) -> None:
-    setting = Setting(max_path, max_nodes, conjunctions=False)
     rng = np.random.default_rng(0)
     rollouts = [play(rng, False) for _ in range(2)]
     record = Record(**{name: np.stack([r[name] for r in rollouts]) for name in rollouts[0]})
     keys = jax.random.split(jax.random.key(0), 2)
-    shapes = jax.eval_shape(relabeller(setting), keys, record, NOTHING_RESERVED, 0.7)
+    shapes = jax.eval_shape(relabeller(max_path, max_nodes), keys, record, NOTHING_RESERVED, 0.7)
     assert shapes.tree.reach.shape == (2, SLOTS, max_nodes, 5)
