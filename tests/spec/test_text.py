@@ -29,7 +29,7 @@ from tests.spec.tasks import NAMES, formulas
 A, B, C, D = map(Prop, "abcd")
 
 
-@settings(max_examples=250, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(formulas())
 @example(Then((Then((Achieve(A), Achieve(B))), Achieve(C))))
 @example(Choice((Achieve(A), Choice((Achieve(Or((A, B))), Achieve(C))))))
@@ -189,14 +189,14 @@ def _survives(text: str) -> None:
     assert all(number is not None and 1 <= number <= len(text) + 1 for number in place), place
 
 
-@settings(max_examples=800, deadline=1000)
+@settings(max_examples=300, deadline=1000)
 @given(st.text(max_size=60))
 def test_any_text_survives(text: str) -> None:
     _survives(text)
 
 
 @pytest.mark.filterwarnings("ignore::hrlspec.spec.SpecWarning")
-@settings(max_examples=800, deadline=2000)
+@settings(max_examples=300, deadline=2000)
 @given(st.lists(st.sampled_from(_WORDS), max_size=40).map(" ".join))
 def test_any_soup_of_words_survives(text: str) -> None:
     _survives(text)

@@ -106,7 +106,7 @@ def test_only_text_is_read() -> None:
 WORDS = st.sampled_from("a b ab true ! X F G U R W M & | -> => <-> ( )".split())
 
 
-@hypothesis.settings(max_examples=500, deadline=None)
+@hypothesis.settings(max_examples=200, deadline=None)
 @hypothesis.given(st.one_of(st.text(max_size=40), st.lists(WORDS, max_size=16).map(" ".join)))
 def test_any_text_is_read_or_refused(text: str) -> None:
     try:
