@@ -23,7 +23,7 @@ def hrlspec(*argv: str | Path, **environ: str) -> subprocess.CompletedProcess[by
     return subprocess.run(command, env=os.environ | environ, cwd=ROOT, capture_output=True, timeout=300, check=False)
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
+@pytest.mark.parametrize("encoding", ["ascii", pytest.param("cp1252", marks=pytest.mark.slow)])
 def test_help_is_readable(encoding: str) -> None:
     ended = hrlspec("run", "--help", TERM="dumb", PYTHONIOENCODING=encoding)
     assert (ended.returncode, ended.stderr) == (0, b"")
