@@ -149,8 +149,9 @@ def test_touching_blue_makes_green_vanish() -> None:
     zones[BLUE, 1], zones[GREEN, 0], zones[RED, 0] = [0.3, 0.0], [1.8, 0.0], [1.8, 0.1]
     for env, green_stays in ((NM, False), (ENV, True)):
         results = _go(env, _state(env, (-0.3, 0.0), zones), 110)
-        labels = np.array([env.labels(result[1], PARAMS) for result in results])
-        lidar = np.array([env.proposition_view(result[0])[0] for result in results])
+        labelled, seen = jax.jit(env.labels), jax.jit(env.proposition_view)
+        labels = np.array([labelled(result[1], PARAMS) for result in results])
+        lidar = np.array([seen(result[0])[0] for result in results])
         touched = int(np.argmax(labels[:, BLUE]))
         assert labels[touched, BLUE]
         assert 0 < touched < 60
@@ -165,7 +166,8 @@ def test_touching_blue_makes_green_vanish() -> None:
     assert not NM.reset_to(results[-1][1].layout, jax.random.key(0), PARAMS)[1].vanished.any()
     zones[[BLUE, GREEN]] = zones[[GREEN, BLUE]]
     zones[GREEN, 0], zones[BLUE, 0] = [0.3, 0.0], [1.8, 0.0]
-    labels = np.array([NM.labels(result[1], PARAMS) for result in _go(NM, _state(NM, (-0.3, 0.0), zones), 110)])
+    labelled = jax.jit(NM.labels)
+    labels = np.array([labelled(result[1], PARAMS) for result in _go(NM, _state(NM, (-0.3, 0.0), zones), 110)])
     assert labels[:, GREEN].any()
     assert labels[:, BLUE].any()
 

@@ -125,8 +125,9 @@ def test_mjx_is_the_closed_form() -> None:
     np.testing.assert_allclose(mjx[1], closed[1], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_scalars_are_mjx_as_it_is() -> None:
-    """One substep of the program taken apart, against MJX's own arrays."""
+    """One substep of the program taken apart, against MJX's own arrays; above it is compared with MuJoCo."""
     with jax.enable_x64(True):
         bodies, controls = (jnp.asarray(array) for array in random_rows(16))
         plain, simple = (zone_physics._mjx_programs(False, scalarized, True) for scalarized in (False, True))
