@@ -64,6 +64,7 @@ def test_it_is_kept_as_it_was_run() -> None:
     assert "execution" not in str([cell.metadata for cell in cells])  # when it ran says nothing to the reader
 
 
+@pytest.mark.slow
 def test_running_it_shows_what_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MPLBACKEND", raising=False)  # else nothing is drawn into the page
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
