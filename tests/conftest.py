@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from pathlib import Path
 
@@ -13,6 +14,9 @@ from tests import typecheck
 typecheck.install()  # before anything that is to be checked is imported
 
 from hrlspec.run.platform import with_loop_option  # noqa: E402
+
+# Tracing makes many objects that stay; looking through them for cycles as often as is the default takes a sixth of it.
+gc.set_threshold(50_000, 20, 100)
 
 # Before the first array is made, so that tests and the processes they start run the same programs, to the bit. Most of
 # the tests' time is compilation: two flags shorten it, of which 0.11.1 is the first release that does not know the
