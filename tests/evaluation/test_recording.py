@@ -12,10 +12,11 @@ import pytest
 
 import envs_jax
 from hrlspec.agent.agent import Agent
+from hrlspec.agent.networks.planner import PlannerConfig
 from hrlspec.config import Config, NetworkConfig
 from hrlspec.evaluation.episodes import trace_episodes
 from hrlspec.evaluation.recording import Record, record_episodes
-from hrlspec.methods import METHODS, ImplicitPlanner, Ours
+from hrlspec.methods import METHODS, OURS, ImplicitPlanner, Ours
 from hrlspec.spec import RUNNING, SATISFIED, TaskTree, advance, compile_task, initial, parse
 from hrlspec.spec.monitor import open_edges
 from hrlspec.tasks.rewards import reward_machine
@@ -24,6 +25,7 @@ from tests.probes import random_params
 SMALL = Config(
     network=NetworkConfig(latent=8, conv_channels=(), encoder_mlp=(8,), actor=(8,), critic=(8,), task_rounds=0)
 )
+SMALL_OURS = OURS.replace(network=PlannerConfig(features=8, hidden=8, rounds=0))
 KEY = jax.random.key(3)
 TASK = "(achieve a or (achieve b ensuring not c)); achieve d"
 
@@ -37,7 +39,7 @@ def setting(env: envs_jax.Environment, method: Any, text: str) -> tuple[Any, ...
     """What three episodes in random layouts are made of."""
     agent = Agent(env, SMALL, method)
     layouts = jax.vmap(env.sample_layout, (0, None))(jax.random.split(KEY, 3), env.default_params)
-    return KEY, agent, random_params(agent, 0), reward_machine(env.propositions), tree_for(env, text), layouts
+    return KEY, agent, random_params(agent, 1), reward_machine(env.propositions), tree_for(env, text), layouts
 
 
 @functools.cache
@@ -52,22 +54,23 @@ def recorded(env: envs_jax.Environment, method: Any, text: str) -> tuple[Any, An
 def test_what_is_recorded_is_what_happens(name: str) -> None:
     env = envs_jax.make(name, horizon=20)
     assert isinstance(env, envs_jax.Drawable)
-    ended, layouts, record = recorded(env, METHODS["ours"], TASK)
+    ended, layouts, record = recorded(env, SMALL_OURS, TASK)
     tree = jax.tree.map(lambda x: jnp.asarray(x[0]), tree_for(env, TASK))
-    step, params = jax.jit(env.step_env), env.default_params
+    step, position, holding, follow = map(jax.jit, (env.step_env, env.position, env.labels, advance))
+    params = env.default_params
     moved = 0
     for i, steps in enumerate(ended.steps):
         _, state = env.reset_to(jax.tree.map(lambda x, i=i: x[i], layouts), jax.random.fold_in(KEY, i), params)
         task = initial(tree)
         for t in range(steps):
             before, after = (jax.tree.map(lambda x, t=t, i=i: x[t, i], x) for x in (record.before, record.after))
-            np.testing.assert_allclose(before.position, env.position(state), atol=1e-6)
-            np.testing.assert_array_equal(before.labels, env.labels(state, params))
+            np.testing.assert_allclose(before.position, position(state), atol=1e-6)
+            np.testing.assert_array_equal(before.labels, holding(state, params))
             assert int(before.state.node) == int(task.node)
             _, state, *_ = step(KEY, state, record.action[t, i], params)
-            labels = env.labels(state, params)
-            task = advance(tree, task, labels, int(record.high.edge[t, i]))
-            np.testing.assert_allclose(after.position, env.position(state), atol=1e-6)
+            labels = holding(state, params)
+            task = follow(tree, task, labels, int(record.high.edge[t, i]))
+            np.testing.assert_allclose(after.position, position(state), atol=1e-6)
             np.testing.assert_array_equal(after.labels, labels)
             np.testing.assert_array_equal(after.state.blocked, task.blocked)
             assert (int(after.state.node), int(after.state.status)) == (int(task.node), int(task.status))
@@ -79,7 +82,7 @@ def test_what_is_recorded_is_what_happens(name: str) -> None:
 
 def test_branches_have_probabilities_and_values_where_a_decision_is_made() -> None:
     env = envs_jax.make("letter", horizon=20)
-    ended, _, record = recorded(env, METHODS["ours"], TASK)
+    ended, _, record = recorded(env, SMALL_OURS, TASK)
     for i, steps in enumerate(ended.steps):
         high = jax.tree.map(lambda x, i=i, steps=steps: x[:steps, i], record.high)
         state = jax.tree.map(lambda x, i=i, steps=steps: x[:steps, i], record.before.state)
