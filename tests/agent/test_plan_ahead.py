@@ -44,12 +44,12 @@ def test_routes_are_the_ways_down() -> None:
 
 def test_forks_are_where_more_than_one_way_leads_on() -> None:
     rng = np.random.default_rng(4)
-    found = {False: 0, True: 0}
+    found, compiled = {False: 0, True: 0}, quick_jit(forks)
     for _ in range(40):
         tree = random_tree(rng, num_nodes=8, num_propositions=4)
         nodes = np.flatnonzero(tree.valid)
         children = np.bincount(tree.parent[nodes[1:]], minlength=8)
-        for node, fork in zip(nodes, np.asarray(forks(on_device(tree)))[nodes], strict=True):
+        for node, fork in zip(nodes, np.asarray(compiled(on_device(tree)))[nodes], strict=True):
             assert fork == any(children[below] > 1 for below in nodes if below == node or way_to(tree, node, below))
             found[bool(fork)] += 1
     assert min(found.values()) > 20
