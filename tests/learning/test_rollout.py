@@ -23,7 +23,7 @@ from hrlspec.learning.experience import gather
 from hrlspec.learning.reach import reach_batch
 from hrlspec.learning.rollout import Collector, Setting, collect, fill_pool
 from hrlspec.learning.train import Trainer
-from hrlspec.methods import Ours
+from hrlspec.methods import LTL2ACTION, Ours
 from hrlspec.spec import TaskState, TaskTree
 from hrlspec.tasks.curriculum import draw_bank
 from hrlspec.tasks.rewards import Bonus, RewardMachine, reward_machine
@@ -486,7 +486,7 @@ def test_without_unfinished_every_sample_was_completed() -> None:
 def test_noise_is_as_correlated_as_it_is_asked_to_be() -> None:
     """An untrained policy of continuous actions is nothing but noise."""
     env = envs_jax.make("walk")
-    agent = small_agent(env, evolve(small_config(num_steps=64), {"shield.enabled": False}))
+    agent = small_agent(env, evolve(small_config(num_steps=64), {"shield.enabled": False}), LTL2ACTION)
     rewards = reward_machine(env.propositions)
     bank = on_device(draw_bank(np.random.default_rng(0), agent.config.curriculum, 5, np.zeros(0, np.uint32)))
 
