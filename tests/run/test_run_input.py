@@ -191,7 +191,7 @@ def test_how_near_the_shield_lets_one_come(env: str, steps: int) -> None:
     assert shield.discount ** (steps - 1) > shield.threshold > shield.discount**steps
 
 
-@pytest.mark.parametrize("env", ["letter", "letter12", "walk", "zone"])
+@pytest.mark.parametrize("env", ["letter", pytest.param("letter12", marks=pytest.mark.slow), "walk", "zone"])
 @pytest.mark.parametrize("recipe", ["paper", "hrlspec"])
 @pytest.mark.parametrize("method", METHODS)
 def test_every_preset_is_accepted(env: str, recipe: Any, method: str) -> None:
