@@ -18,6 +18,7 @@ from tests.trees import random_tree
 
 ENV = Corridor()
 LENGTH = 3
+follow = quick_jit(advance)
 
 
 def way_to(tree: TaskTree, node: int, below: int) -> list[int]:
@@ -76,10 +77,11 @@ def test_where_nothing_is_to_choose_the_planner_would_choose_the_same(advice: fl
         state = initial(tree)
         for _ in range(int(rng.integers(3))):
             labels = jnp.asarray(rng.random(ENV.num_propositions) < 0.4)
-            state = advance(tree, state, labels, TaskTree.NO_NODE)
+            state = follow(tree, state, labels, TaskTree.NO_NODE)
         edge, choice, instructions = jax.tree.map(np.asarray, both(tree, state))
         ways = [way_to(tree, int(state.node), leaf) for leaf in np.flatnonzero(tree.accepting)]
-        open_ways = [way for way in ways if way and open_edges(tree, state)[way[0]]]
+        is_open = np.asarray(open_edges(tree, state))
+        open_ways = [way for way in ways if way and is_open[way[0]]]
         edges = {way[0] for way in open_ways}
         assert (edge != TaskTree.NO_NODE) == (len(open_ways if advice else edges) == 1)
         if edge != TaskTree.NO_NODE:
@@ -92,9 +94,10 @@ def test_where_nothing_is_to_choose_the_planner_would_choose_the_same(advice: fl
 
 def test_lookahead_collects_what_each_depth_reaches() -> None:
     rng = np.random.default_rng(1)
+    compiled = quick_jit(lambda tree: lookahead(tree, 2))
     for _ in range(10):
         tree = random_tree(rng, num_nodes=8, num_propositions=4)
-        ahead = np.asarray(lookahead(on_device(tree), 2))
+        ahead = np.asarray(compiled(on_device(tree)))
         for node in np.flatnonzero(tree.valid):
             for steps in (1, 2):
                 below = [k for k in np.flatnonzero(tree.valid) if len(way_to(tree, node, k)) == steps]
@@ -103,9 +106,10 @@ def test_lookahead_collects_what_each_depth_reaches() -> None:
 
 def test_lookback_recalls_what_was_reached_on_the_way() -> None:
     rng = np.random.default_rng(3)
+    compiled = quick_jit(lambda tree: lookback(tree, 3))
     for _ in range(10):
         tree = random_tree(rng, num_nodes=8, num_propositions=4)
-        behind = np.asarray(lookback(on_device(tree), 3))
+        behind = np.asarray(compiled(on_device(tree)))
         for edge in np.flatnonzero(tree.valid)[1:]:
             earlier = tree.reach[way_to(tree, TaskTree.ROOT, edge)[-2::-1]][:3]
             np.testing.assert_array_equal(behind[edge], np.pad(earlier, ((0, 3 - len(earlier)), (0, 0))))
@@ -128,9 +132,9 @@ def test_the_low_level_remembers_as_much_as_it_is_told_to() -> None:
         network = dataclasses.replace(small_config().network, roles=True, memory=memory)
         agent = small_agent(ENV, small_config(network=network))
         params = random_params(agent, 4)
-        instruction = agent.low.instruct(params, tree)
+        instruction, control = quick_jit(agent.low.instruct)(params, tree), quick_jit(agent.low.control)
         last = [jax.tree.map(lambda x, e=edge: x[e], instruction) for edge in (3, 4)]
-        values = [float(agent.low.control(params, ENV.view_at(2), some)[1]) for some in last]
+        values = [float(control(params, ENV.view_at(2), some)[1]) for some in last]
         assert (abs(values[0] - values[1]) > 1e-3) == bool(memory)
 
 
@@ -140,14 +144,15 @@ def test_advice_is_the_value_of_the_best_way_and_that_way_is_handed_down() -> No
     agent = small_agent(ENV, small_config(network=network), Ours(high=planner))
     params, view = random_params(agent, 2), ENV.view_at(2)
     control = quick_jit(lambda instruction: agent.low.control(params, view, instruction)[1])
+    instruct = quick_jit(agent.low.instruct)
     advise = quick_jit(lambda *batch: planner.advise(agent.low, params, *batch))
     rng = np.random.default_rng(2)
     several = 0
     for _ in range(20):
         tree = on_device(random_tree(rng, num_nodes=9, num_propositions=ENV.num_propositions, distinct=True))
         labels = jnp.asarray(rng.random(ENV.num_propositions) < 0.4)
-        state = advance(tree, initial(tree), labels, TaskTree.NO_NODE)
-        instruction = agent.low.instruct(params, tree)
+        state = follow(tree, initial(tree), labels, TaskTree.NO_NODE)
+        instruction = instruct(params, tree)
         batch = jax.tree.map(lambda x: x[None], (view, tree, state, instruction))
         advice, ahead = jax.tree.map(lambda x: x[0], advise(*batch))
         for edge in np.flatnonzero(open_edges(tree, state)):

@@ -545,20 +545,25 @@ def test_an_exported_agent_acts_as_the_run_does(
     assert reports[0] == reports[1]
 
 
-def test_training_goes_on_from_an_exported_agent(
-    finished: Path, exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Everything but the parameters is fresh, and a run that goes on needs the same ones."""
-    folder, file = tmp_path / "run", read_agent(exported)
-    flags = tiny.arguments(folder, "--from", str(exported))
-    ((experiment, _),) = experiments_of(parse_run(flags))
-    fresh = Learner(experiment, experiment.preset).job().init()
-    begun = Learner(experiment, experiment.preset, params=hrlspec.pretrained(exported).params).job().init()
+def test_training_begins_with_an_exported_agent(exported: Path, tmp_path: Path) -> None:
+    """Everything but the parameters is fresh."""
+    ((experiment, _),) = experiments_of(parse_run(tiny.arguments(tmp_path / "run", "--from", str(exported))))
     given = hrlspec.pretrained(exported).params
+    fresh = Learner(experiment, experiment.preset).job().init()
+    begun = Learner(experiment, experiment.preset, params=given).job().init()
     assert state_hash({name: begun.params[name] for name in given}) == state_hash(given)
     assert state_hash(begun.replace(params=fresh.params)) == state_hash(fresh)
     assert state_hash(begun.params["reach_critic"]) == state_hash(fresh.params["reach_critic"])
     assert jax.tree.map(lambda x: x.sharding, begun) == jax.tree.map(lambda x: x.sharding, fresh)
+
+
+@pytest.mark.slow
+def test_training_goes_on_from_an_exported_agent(
+    finished: Path, exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A run that goes on needs the same parameters to begin from."""
+    folder, file = tmp_path / "run", read_agent(exported)
+    flags = tiny.arguments(folder, "--from", str(exported))
     assert call(*flags) == 0
     assert read_record(folder)["config"]["begun_from"] == file.card.sha256
     assert rows(folder) != rows(finished)
