@@ -83,8 +83,10 @@ def test_the_packages_are_those_of_the_wheel(scripts: Path, tmp_path: Path) -> N
     assert all(Path(file).is_relative_to(scripts.parent) for file in files)
     assert tasks == "200"
     assert "No module named 'experiments'" in call(scripts / "python", "-c", "import experiments", cwd=tmp_path).stderr
+    assert call(scripts / "hrlspec", "--version", cwd=tmp_path).stdout == f"hrlspec {__version__}\n"
 
 
+@pytest.mark.slow
 def test_an_agent_acts_without_training(scripts: Path, tmp_path: Path) -> None:
     flags = ["--pretrained", "letter", "--spec", "achieve a", "--episodes", "20", "--json"]
     said = call(scripts / "hrlspec", "evaluate", *flags, cwd=tmp_path)
@@ -97,7 +99,6 @@ def test_an_agent_acts_without_training(scripts: Path, tmp_path: Path) -> None:
 def test_the_command(scripts: Path, tmp_path: Path) -> None:
     """Help, a run of a few steps with pictures, what only a checkout can do."""
     hrlspec = scripts / "hrlspec"
-    assert call(hrlspec, "--version", cwd=tmp_path).stdout == f"hrlspec {__version__}\n"
     assert "evaluate" in call(hrlspec, "--help", cwd=tmp_path).stdout
     ended = call(hrlspec, "run", *tiny.arguments(Path("here")), cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr

@@ -403,16 +403,14 @@ def test_an_automaton_is_written_and_read_again(
         (scores,) = found["per_formula"]
         return scores
 
-    files = [tmp_path / "new" / f"task.{form}" for form in ("dot", "svg", "hoa", "json")]
-    spec = ("--spec", "achieve a; ((achieve b; achieve d) ensuring not c)", "--semantics", "exact")
-    first = report(*spec, "--automaton", str(files[0]))
-    assert (first["formula"], first["automaton_states"]) == (spec[1], 4)
-    assert '  2 -> 1 [label="c"]\n' in files[0].read_text()
-    for file in files[1:]:
-        assert report(*spec, "--automaton", str(file)) == first
-    assert files[1].read_text().startswith("<?xml")
-    for flag, file in (("--hoa", files[2]), ("--dfa", files[3])):
-        assert report(flag, str(file)) == first | {"formula": file.name}
+    dot, svg, hoa, dfa = (tmp_path / "new" / f"task.{form}" for form in ("dot", "svg", "hoa", "json"))
+    spec = "achieve a; ((achieve b; achieve d) ensuring not c)"
+    first = report("--spec", spec, "--semantics", "exact", "--automaton", str(hoa))
+    assert (first["formula"], first["automaton_states"]) == (spec, 4)
+    for flag, given, file in (("--hoa", hoa, dfa), ("--dfa", dfa, dot), ("--dfa", dfa, svg)):
+        assert report(flag, str(given), "--automaton", str(file)) == first | {"formula": given.name}
+    assert '  2 -> 1 [label="c"]\n' in dot.read_text()
+    assert svg.read_text().startswith("<?xml")
 
 
 def test_the_automaton_of_a_tree_is_written_beside_its_results(
