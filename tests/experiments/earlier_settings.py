@@ -43,6 +43,7 @@ NEW = {
     "config.shield.optimiser.epochs": 1,
     "config.shield.optimiser.max_grad_norm": 1.0,
     "config.curriculum.joint": 0.0,
+    "config.network.chart": [],
     "begun_from": None,
 }
 """Settings with the value that the code had before."""
