@@ -24,9 +24,15 @@ class ConfigError(ValueError):
     """A setting that cannot be meant. The message names it, what was found and what was expected."""
 
 
-def setting(default: Any, *, least: float = -math.inf, most: float = math.inf) -> Any:
-    """A field with a default and the range that its value, or each entry of a tuple, must lie in (bounds included)."""
-    return dataclasses.field(default=default, metadata={"range": (least, most)})
+def setting(default: Any, *, least: float = -math.inf, most: float = math.inf, later: bool = False) -> Any:
+    """A field with a default.
+
+    Args:
+        default: its value where none is given.
+        least, most: the range that the value, or each entry of a tuple, must lie in (bounds included).
+        later: whether it came after records were kept, which may lack it: its default is what the code did before.
+    """
+    return dataclasses.field(default=default, metadata={"range": (least, most), "later": later})
 
 
 class Checked:
@@ -111,7 +117,7 @@ class NetworkConfig(Checked):
     """Scale of the sub-task features that condition the low level: unscaled, a few binary features carry little weight
     beside a hundred of the latent. The embedding of the remaining task is not scaled, or it would outweigh the
     sub-task. Without a sub-task, conditioned on the whole task, the embedding is scaled."""
-    chart: tuple[int, ...] = setting((), least=1)
+    chart: tuple[int, ...] = setting((), least=1, later=True)
     """Layers of a chart: a network from the shared part of the observation to features of each proposition, as many as
     the last width says, which the low level sees by role beside what the world shows. For worlds that show the position
     alone: what is learned of a region in front of one goal is known of it in front of all others. Empty: no chart."""
@@ -320,14 +326,17 @@ def from_plain(example: S, data: Any, *, prefix: str = "", needed: Callable[[str
         example: settings of the same type, all the way down.
         data: a value for each of the settings, under its name.
         prefix: of their names, with its dot.
-        needed: whether the setting of a dotted name must be there; another is the example's where it is missing.
+        needed: whether the setting of a dotted name must be there, unless it is a later one; another is the example's
+            where it is missing.
 
     Raises:
         ConfigError: settings are missing or unknown, or a value is of another type or out of its range.
     """
-    fields = {field.name: getattr(example, field.name) for field in dataclasses.fields(example)}  # type: ignore[arg-type]
     if not isinstance(data, Mapping):
         raise ConfigError(f"{prefix.rstrip('.')} is {data!r}")
+    known = dataclasses.fields(example)  # type: ignore[arg-type]
+    data = {field.name: field.default for field in known if field.metadata.get("later")} | dict(data)
+    fields = {field.name: getattr(example, field.name) for field in known}
     wrong = (data.keys() - fields) | {name for name in fields.keys() - data if needed(prefix + name)}
     if wrong:
         raise ConfigError(f"the setting {prefix + min(wrong)!r} is not in both")

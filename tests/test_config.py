@@ -20,6 +20,7 @@ from hrlspec.config import (
     RelabelConfig,
     ShieldConfig,
     evolve,
+    from_plain,
 )
 from hrlspec.methods import ImplicitPlanner, Ours
 from hrlspec.methods.option import LogicValueIteration
@@ -299,3 +300,14 @@ def test_settings_can_be_static_arguments() -> None:
     assert hash(Config()) == hash(evolve(Config(), {"discount": Config.discount}))
     with pytest.raises(dataclasses.FrozenInstanceError):
         Config().discount = 0.5  # type: ignore[misc]
+
+
+def test_a_record_may_lack_a_later_setting_and_no_other() -> None:
+    network = NetworkConfig(latent=8, chart=(4, 2))
+    record = dataclasses.asdict(network)
+    assert from_plain(NetworkConfig(), record) == network
+    del record["chart"]
+    assert from_plain(network, record) == dataclasses.replace(network, chart=())  # as it was before there were any
+    del record["latent"]
+    with pytest.raises(ConfigError, match=r"^the setting 'network.latent' is not in both$"):
+        from_plain(network, record, prefix="network.")

@@ -68,7 +68,7 @@ class Experiment:
     evaluation: EvaluationConfig
     config: Config
     method_settings: Method
-    begun_from: str | None = None
+    begun_from: str | None = setting(None, later=True)
 
     @property
     def name(self) -> str:
@@ -125,7 +125,6 @@ def experiment_of(record: Mapping[str, Any], where: str, *, to_act: bool = False
         raise UserError(f"{where} is a run that cannot be read here: {error}") from None
     example = Experiment("", "", "hrlspec", 1, 0, EvaluationConfig(), Config(), method)
     try:
-        # Before training could begin from given parameters, every run began afresh.
-        return from_plain(example, {"begun_from": None, **record}, needed=acts if to_act else lambda _: True)
+        return from_plain(example, record, needed=acts if to_act else lambda _: True)
     except ConfigError as error:
         raise UserError(f"{where} was made by another version of hrlspec: {error}") from None
