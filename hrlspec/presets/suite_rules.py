@@ -31,8 +31,8 @@ class SuiteRule:
         about: a line for its readers.
         draws: samplers, each of which contributes the same number of tasks up to rounding.
         keep: which of the drawn trees are taken, bool ``[M]``.
-        scarce: whether a sampler may find few tasks: then at most a quarter of those that it found is taken, so that
-            enough are left to train on. Otherwise that is an error.
+        scarce: whether a sampler may find few tasks: then at most a quarter of those that it found is taken, and no
+            sequence, of which there are fewer still, so that enough are left to train on. Otherwise that is an error.
     """
 
     about: str
@@ -85,6 +85,12 @@ def root_children(tasks: TaskTree) -> np.ndarray:
 def shortest(tasks: TaskTree) -> np.ndarray:
     """Sub-tasks on the shortest way to satisfy each task, int ``[M]``."""
     return np.where(tasks.accepting, tasks.depth, np.iinfo(np.int32).max).min(-1)
+
+
+def has_fork(tasks: TaskTree) -> np.ndarray:
+    """Whether some node has several children, bool ``[M]``; tasks without are sequences."""
+    nodes = np.arange(tasks.parent.shape[-1])
+    return ((np.asarray(tasks.parent)[..., None] == nodes).sum(-2) > 1).any(-1)
 
 
 def always_avoids(tasks: TaskTree) -> np.ndarray:
@@ -158,10 +164,11 @@ def draw_suite(
         first = np.zeros(len(hashes), bool)
         first[np.unique(hashes, return_index=True)[1]] = True
         rows = np.flatnonzero(first & rule.keep(drawn))
-        wanted = min(share, len(rows) // 4) if rule.scarce else share
-        if len(rows) < wanted:
+        if rule.scarce and len(rows) < 4 * share:
+            rows = rows[has_fork(drawn)[rows]][: len(rows) // 4]
+        elif len(rows) < share:
             raise ValueError(f"{where}: only {len(rows)} of {share} tasks among {len(hashes)} drawn ones")
-        rows = rows[:wanted]
+        rows = rows[:share]
         parts.append(jax.tree.map(lambda x, rows=rows: x[rows], drawn))
         taken = np.concatenate([taken, hashes[rows]])
     result: TaskTree = jax.tree.map(lambda *x: np.concatenate(x), *parts)
