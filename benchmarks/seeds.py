@@ -154,13 +154,15 @@ def main() -> None:
     flags = tyro.cli(Flags, description=__doc__)
     prepare(host_devices=flags.devices)
     jax.config.update("jax_enable_compilation_cache", False)
-    asked = {"env": flags.env, "recipe": flags.recipe}
+    asked = {name: value for name, value in dataclasses.asdict(flags).items() if name != "out"}
     report = {
         **asked,
         "contestants": compare(flags),
         "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
     }
-    text = json.dumps({**report, **circumstances()}, indent=2)
+    # The flags are told above, and the rest of the command is where this machine keeps its files.
+    found = {name: value for name, value in circumstances().items() if name != "command"}
+    text = json.dumps({**report, **found}, indent=2)
     print(text)
     if flags.out:
         flags.out.write_text(text + "\n")

@@ -13,6 +13,8 @@ import hrlspec
 from experiments.pretrain import AGENTS, tables
 from hrlspec.agent_files import PACKAGED, packaged_agents, read_agent, read_params
 from hrlspec.api import TrainedAgent
+from hrlspec.run.commands.run import check_beginning
+from hrlspec.run.run_flags import experiments_of, parse_run
 from tests.agent_files.made import same
 from tests.probes import random_params
 
@@ -64,6 +66,15 @@ def test_an_agent_that_was_not_trained_is_found_out() -> None:
     trained = hrlspec.pretrained("letter")
     params = random_params(trained.agent, 0)
     assert not enough(successes(TrainedAgent(trained.agent, params, trained.rewards), "letter"), 0.9)
+
+
+@pytest.mark.parametrize("name", packaged_agents())
+def test_training_can_begin_with_an_agent(name: str) -> None:
+    flags = parse_run(["--env", name, "--from", name])
+    ((experiment, _),) = experiments_of(flags)
+    file = check_beginning(flags, experiment)
+    assert file is not None
+    assert file.path == read_agent(name).path
 
 
 @pytest.mark.parametrize("name", packaged_agents())

@@ -130,7 +130,8 @@ def _file_that_fits(name: str, experiment: Experiment) -> AgentFile:
         UserError: it has not.
     """
     file = find_file(name)
-    for setting, (there, here) in differences(file.card.config, experiment).items():
+    origin = experiment_of(file.card.config, name, to_act=True)
+    for setting, (there, here) in differences(origin, experiment).items():
         if setting in ("env", "method") or re.match(r"(config|method_settings\..*)\.network\.", setting):
             raise UserError(f"--from {name} has {setting} = {there!r}, not {here!r}: train on with what it has")
     return file
