@@ -159,6 +159,7 @@ def joined(address: str | None, count: int | None = None, index: int | None = No
 def _join(address: str, count: int | None, index: int | None) -> Hosts:
     from jax._src.distributed import global_state
 
+    _share_core()
     options: dict[str, Any] = {}
     if address != AUTO:
         options = {"coordinator_address": address, "num_processes": count, "process_id": index}
@@ -178,6 +179,17 @@ def _join(address: str, count: int | None, index: int | None) -> Hosts:
             "this process, give HOST:PORT, --num-processes and --process-id"
         ) from error
     return Hosts(global_state.num_processes, global_state.process_id)
+
+
+def _share_core() -> None:
+    """Threads of this process, those that it starts from here on, run one after the other where they share a core.
+
+    Else, with a core for each process, what arrives waits for the scheduler's next tick: 4 ms for any transfer, when
+    that of 350 numbers takes .05 ms.
+    """
+    if hasattr(os, "SCHED_BATCH") and os.sched_getscheduler(0) == os.SCHED_OTHER:
+        with contextlib.suppress(OSError):  # some containers forbid it
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
 def _leave(error: BaseException, stderr: TextIO) -> NoReturn:
