@@ -163,8 +163,10 @@ def _mjx_model(walls: bool, x64: bool) -> tuple[Any, Any]:
     mujoco, mjx = import_mjx()
     with jax.enable_x64(x64), jax.ensure_compile_time_eval():
         native = mujoco.MjModel.from_xml_string(model_xml(walls=walls))
-        model = mjx.put_model(native, impl="jax")
-        return model, mjx.make_data(model, impl="jax")
+        # MJX's own choice is the first device of all processes, which may be another one's.
+        mine = jax.local_devices()[0]
+        model = mjx.put_model(native, impl="jax", device=mine)
+        return model, mjx.make_data(model, impl="jax", device=mine)
 
 
 @functools.cache

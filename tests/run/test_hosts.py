@@ -133,9 +133,12 @@ def assert_same(folder: Path, other: Path) -> None:
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return in_one(tmp_path_factory.mktemp("alone") / "run")
+
+
+def in_one(folder: Path, *more: str) -> Path:
     """The run in one process, on two devices."""
-    folder = tmp_path_factory.mktemp("alone") / "run"
-    with running(run_command(folder, "--devices", "2"), folder.parent / "said") as process:
+    with running(run_command(folder, "--devices", "2", *more), folder.parent / "said") as process:
         assert process.wait() == 0, process.err
     return folder
 
@@ -154,6 +157,13 @@ def test_two_processes_are_one_with_two_devices(alone: Path, tmp_path: Path) -> 
     assert "results, curves and pictures" in first.out
     assert "Gloo" not in first.out
     assert_same(folder, alone)
+
+
+def test_zone_too(tmp_path: Path) -> None:
+    """Its physics comes with arrays of its own, which must be this process's."""
+    with launched(tmp_path / "run", "--env", "zone") as launcher:
+        assert launcher.wait() == 0, launcher.err
+    assert_same(tmp_path / "run", in_one(tmp_path / "one" / "run", "--env", "zone"))
 
 
 def test_a_signal_to_the_second_stops_both(alone: Path, tmp_path: Path) -> None:
