@@ -5,7 +5,8 @@ python -m benchmarks.scale_model [--envs letter walk zone] [--recipe hrlspec] [-
 What devices exchange is read off the traced program, and memory off the shapes: neither needs a measurement. Constants
 are measured on two cores of this machine: an iteration of the preset's environments, and of half of them, on one core
 while the other does the same; and sums over two devices, of rows of several lengths. From these an iteration on two
-devices is predicted, and then measured. Run it on an otherwise idle machine with two cores or more.
+devices is predicted, and is measured too, by turns with the others. Run it on an otherwise idle machine with two cores
+or more.
 
 Axes: **D** devices, one block of environments on each.
 """
@@ -57,8 +58,10 @@ class Flags:
     """Of one device, GB/s: what 10 and 100 Gbit/s of Ethernet are, and of the order of links between accelerators."""
     latency: float = 30e-6
     """Seconds of an exchange however short, for these bandwidths; an assumption."""
-    seconds: float = 20.0
-    """At least this long for each figure."""
+    seconds: float = 10.0
+    """At least this long for each figure, each time."""
+    turns: int = 3
+    """How often iterations are timed, one core and two devices by turns."""
     measure: bool = True
     """Measure constants, and an iteration on two devices."""
     out: Path | None = None
@@ -221,15 +224,21 @@ def measured(name: str, known: Mapping[str, Any], sums: Mapping[str, Any], flags
     cores = sorted(os.sched_getaffinity(0))[:2]
     apart, together = [Place(cores=[core]) for core in cores], [Place(cores=cores)]
     num_envs = known["num_envs"]
-    half, whole = (iterations_of(apart, f"{name}:1:{number}", flags) for number in (num_envs // 2, num_envs))
+    cases = [(apart, f"{name}:1:{num_envs // 2}"), (apart, f"{name}:1:{num_envs}"), (together, f"{name}:2:{num_envs}")]
+    turns = [[iterations_of(where, what, flags) for where, what in cases] for _ in range(flags.turns)]
+    half, whole, found = (statistics.median(times) for times in zip(*turns, strict=True))
     exchange = exchange_seconds([Sum(**one) for one in known["sums"]], 2, sums["latency_s"], sums["bytes_per_s"])
-    found = iterations_of(together, f"{name}:2:{num_envs}", flags)
     return {
         "one_core_s": {num_envs // 2: half, num_envs: whole},
         "fixed_s": 2 * half - whole,  # of a line through both
         "per_env_s": (whole - half) / (num_envs - num_envs // 2),
         "exchange_s": exchange,
-        "two_devices_s": {"predicted": half + exchange, "measured": found, "error": (half + exchange) / found - 1},
+        "two_devices_s": {
+            "predicted": half + exchange,
+            "measured": found,
+            "error": (half + exchange) / found - 1,
+            "errors": [(turn[0] + exchange) / turn[2] - 1 for turn in turns],
+        },
     }
 
 

@@ -29,8 +29,10 @@ from hrlspec.config import (
     ShieldConfig,
     evolve,
 )
+from hrlspec.evaluation import suite_from_text
 from hrlspec.methods import ImplicitPlanner, Method, Ours
 from hrlspec.spec.tree import TaskTree
+from hrlspec.tasks.bank import ITERATIONS_PER_BANK
 from tests.trees import tree_of
 
 
@@ -175,6 +177,15 @@ def small_config(**changes: Any) -> Config:
         shield=ShieldConfig(optimiser=evolve(ShieldConfig.optimiser, {"minibatches": 4})),
     )
     return dataclasses.replace(config, **changes)
+
+
+ITERATIONS = ITERATIONS_PER_BANK + 1
+"""So many that a second bank is drawn."""
+CORRIDOR_CONFIG = small_config(num_envs=16, num_steps=16, total_steps=ITERATIONS * 16 * 16)
+CORRIDOR_HELD_OUT = suite_from_text(
+    "held out", "achieve a\nachieve a; achieve b\nachieve b or achieve c", Corridor().propositions
+)
+"""What several files train the corridor with: it is compiled once for all of them."""
 
 
 def small_planner(**changes: Any) -> ImplicitPlanner:

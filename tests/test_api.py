@@ -23,17 +23,15 @@ from hrlspec.methods import Ours
 from hrlspec.spec import SpecError, task_hashes
 from hrlspec.tasks.bank import ITERATIONS_PER_BANK, TaskBanks
 from hrlspec.tasks.rewards import reward_machine
-from tests.probes import Corridor, random_params, small_config, small_planner
+from tests.probes import CORRIDOR_CONFIG, CORRIDOR_HELD_OUT, ITERATIONS, Corridor, random_params, small_planner
 
 # a at 0, b at 4, c at 5; episodes start at 1, 2 or 3.
 ENV = Corridor()
 METHOD = Ours(high=small_planner())
 STEPS_PER_ITERATION = 16 * 16
-ITERATIONS = ITERATIONS_PER_BANK + 1
-"""So many that a second bank is drawn."""
-CONFIG = small_config(num_envs=16, num_steps=16, total_steps=ITERATIONS * STEPS_PER_ITERATION)
-CHANGES = {field.name: getattr(CONFIG, field.name) for field in dataclasses.fields(CONFIG)} | {"total_steps": 1}
-HELD_OUT = suite_from_text("held out", "achieve a\nachieve a; achieve b\nachieve b or achieve c", ENV.propositions)
+CHANGES = {field.name: getattr(CORRIDOR_CONFIG, field.name) for field in dataclasses.fields(CORRIDOR_CONFIG)} | {
+    "total_steps": 1
+}
 SEEDS = (3, 8)
 
 History = list[tuple[int, dict[str, np.ndarray]]]
@@ -44,10 +42,10 @@ def train(key: jax.Array) -> tuple[TrainedAgent, History]:
     trained = hrlspec.train(
         key,
         ENV,
-        total_steps=CONFIG.total_steps,
+        total_steps=CORRIDOR_CONFIG.total_steps,
         method=METHOD,
         changes=CHANGES,
-        held_out=HELD_OUT,
+        held_out=CORRIDOR_HELD_OUT,
         progress=lambda steps, metrics: history.append((steps, dict(metrics))),
     )
     return trained, history
@@ -73,9 +71,9 @@ def flat(params: Any) -> np.ndarray:
 @pytest.mark.slow
 def test_training_is_the_loop_that_anybody_can_write() -> None:
     """To the bit: with the settings that the changes make, banks drawn from the seed, and what is held out left out."""
-    trainer, machine = Trainer(Agent(ENV, CONFIG, METHOD)), reward_machine(ENV.propositions)
-    reserved = np.unique(HELD_OUT.hashes)
-    banks = TaskBanks(SEEDS[0], CONFIG.curriculum, ENV.num_propositions, reserved)
+    trainer, machine = Trainer(Agent(ENV, CORRIDOR_CONFIG, METHOD)), reward_machine(ENV.propositions)
+    reserved = np.unique(CORRIDOR_HELD_OUT.hashes)
+    banks = TaskBanks(SEEDS[0], CORRIDOR_CONFIG.curriculum, ENV.num_propositions, reserved)
     state = trainer.init(jax.random.key(SEEDS[0]), banks.at(0), machine)
     metrics = []
     for i in range(ITERATIONS):
@@ -89,9 +87,9 @@ def test_training_is_the_loop_that_anybody_can_write() -> None:
 
 @pytest.mark.slow
 def test_training_can_be_vmapped_and_scanned_by_other_code() -> None:
-    trainer, machine = Trainer(Agent(ENV, CONFIG, METHOD)), reward_machine(ENV.propositions)
-    reserved = jnp.asarray(np.unique(HELD_OUT.hashes))
-    bank = TaskBanks(0, CONFIG.curriculum, ENV.num_propositions, np.unique(HELD_OUT.hashes)).at(0)
+    trainer, machine = Trainer(Agent(ENV, CORRIDOR_CONFIG, METHOD)), reward_machine(ENV.propositions)
+    reserved = jnp.asarray(np.unique(CORRIDOR_HELD_OUT.hashes))
+    bank = TaskBanks(0, CORRIDOR_CONFIG.curriculum, ENV.num_propositions, np.unique(CORRIDOR_HELD_OUT.hashes)).at(0)
 
     def trained(key: jax.Array) -> Any:
         begun = trainer.init(key, bank, machine)
@@ -107,7 +105,7 @@ def test_training_can_be_vmapped_and_scanned_by_other_code() -> None:
 def test_progress_is_told_after_each_iteration(several: bool) -> None:
     history, shape = (together()[1], (len(SEEDS),)) if several else (alone(SEEDS[0])[1], ())
     assert [steps for steps, _ in history] == [STEPS_PER_ITERATION * (i + 1) for i in range(ITERATIONS)]
-    assert history[-1][0] == CONFIG.total_steps
+    assert history[-1][0] == CORRIDOR_CONFIG.total_steps
     for _, metrics in history:
         assert {"episodes", "successes", "returns", "level", "low/value_loss", "high/value_loss"} <= metrics.keys()
         assert {np.shape(value) for value in metrics.values()} == {shape}
@@ -127,7 +125,9 @@ def test_seeds_side_by_side_are_seeds_alone() -> None:
     for i, seed in enumerate(SEEDS):
         one, history = alone(seed)
         assert both.agent == one.agent
-        bank = TaskBanks(seed, CONFIG.curriculum, ENV.num_propositions, np.unique(HELD_OUT.hashes)).at(0)
+        bank = TaskBanks(
+            seed, CORRIDOR_CONFIG.curriculum, ENV.num_propositions, np.unique(CORRIDOR_HELD_OUT.hashes)
+        ).at(0)
         begun = flat(trainer.init(jax.random.key(seed), bank, one.rewards).params)
         found, expected = flat(both[i].params), flat(one.params)
         way = np.linalg.norm(expected - begun)
@@ -151,11 +151,11 @@ def test_one_of_agents_trained_side_by_side() -> None:
 
 def test_what_is_held_out_would_have_been_trained_on() -> None:
     def hashes(reserved: np.ndarray) -> np.ndarray:
-        banks = TaskBanks(SEEDS[0], CONFIG.curriculum, ENV.num_propositions, reserved)
+        banks = TaskBanks(SEEDS[0], CORRIDOR_CONFIG.curriculum, ENV.num_propositions, reserved)
         return np.concatenate([task_hashes(banks.at(i)) for i in (0, ITERATIONS_PER_BANK)])
 
-    assert np.isin(hashes(np.zeros(0, np.uint32)), HELD_OUT.hashes).any()
-    assert not np.isin(hashes(np.unique(HELD_OUT.hashes)), HELD_OUT.hashes).any()
+    assert np.isin(hashes(np.zeros(0, np.uint32)), CORRIDOR_HELD_OUT.hashes).any()
+    assert not np.isin(hashes(np.unique(CORRIDOR_HELD_OUT.hashes)), CORRIDOR_HELD_OUT.hashes).any()
 
 
 @pytest.mark.parametrize(
@@ -200,7 +200,7 @@ class Obedient(Agent):
 
 @functools.cache
 def obedient() -> TrainedAgent:
-    agent = Obedient(ENV, evolve(CONFIG, {"num_envs": 32}), METHOD)
+    agent = Obedient(ENV, evolve(CORRIDOR_CONFIG, {"num_envs": 32}), METHOD)
     return TrainedAgent(agent, random_params(agent, 0), reward_machine(ENV.propositions, completion=2.0))
 
 

@@ -16,12 +16,20 @@ from hrlspec.evaluation.episodes import run_episodes
 from hrlspec.learning.train import Trainer, TrainState
 from hrlspec.tasks.bank import ITERATIONS_PER_BANK, TaskBanks
 from hrlspec.tasks.rewards import reward_machine
-from tests.probes import Corridor, bank_of, on_device, probe_task, random_params, small_agent
-from tests.test_api import CONFIG, HELD_OUT
+from tests.probes import (
+    CORRIDOR_CONFIG,
+    CORRIDOR_HELD_OUT,
+    Corridor,
+    bank_of,
+    on_device,
+    probe_task,
+    random_params,
+    small_agent,
+)
 
 ENV = Corridor()
-TRAINER = Trainer(small_agent(ENV, CONFIG))
-BANKS = TaskBanks(0, CONFIG.curriculum, ENV.num_propositions, np.zeros(0, np.uint32))
+TRAINER = Trainer(small_agent(ENV, CORRIDOR_CONFIG))
+BANKS = TaskBanks(0, CORRIDOR_CONFIG.curriculum, ENV.num_propositions, np.zeros(0, np.uint32))
 
 step = Trainer.iterate
 """With the settings of the API's tests, which train by the same program."""
@@ -31,7 +39,7 @@ def fresh() -> tuple[TrainState, Any, Any]:
     """A state, rewards, and what is reserved, on the device."""
     machine = on_device(reward_machine(ENV.propositions))
     state = TRAINER.init(jax.random.key(0), BANKS.at(0), machine)
-    return state, machine, jnp.zeros(len(HELD_OUT), jnp.uint32)
+    return state, machine, jnp.zeros(len(CORRIDOR_HELD_OUT), jnp.uint32)
 
 
 def with_full_window(state: TrainState) -> TrainState:
@@ -64,7 +72,7 @@ def test_training_has_no_business_with_the_host() -> None:
         for _ in range(3):
             state, metrics = step(TRAINER, state, bank, machine, reserved)
         with pytest.raises(Exception, match="Disallowed host-to-device transfer"):
-            step(TRAINER, state, bank, machine, np.zeros(len(HELD_OUT), np.uint32))
+            step(TRAINER, state, bank, machine, np.zeros(len(CORRIDOR_HELD_OUT), np.uint32))
     assert metrics["level"] >= 1
     program = step.lower(TRAINER, fresh()[0], bank, machine, reserved).as_text()
     for word in ("callback", "infeed", "outfeed", "send", "recv"):
@@ -79,7 +87,7 @@ def test_an_evaluation_is_traced_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(episodes, "start", begin)
     # No other test has this agent, whose programs it would otherwise find compiled.
     env = Corridor(horizon=11)
-    agent = small_agent(env, CONFIG)
+    agent = small_agent(env, CORRIDOR_CONFIG)
 
     def evaluate(names: list[str], seed: int, completion: float = 1.0, **how: Any) -> Any:
         trees = bank_of([probe_task(name, num_propositions=4, num_nodes=6) for name in names], 20)

@@ -16,11 +16,10 @@ from hrlspec.learning.seeds import Seeds
 from hrlspec.learning.train import Trainer, TrainState
 from hrlspec.tasks.bank import ITERATIONS_PER_BANK, TaskBanks
 from hrlspec.tasks.rewards import reward_machine
-from tests.probes import Corridor, assert_agree, on_device, quick_jit, small_agent
-from tests.test_api import CONFIG, HELD_OUT
+from tests.probes import CORRIDOR_CONFIG, CORRIDOR_HELD_OUT, Corridor, assert_agree, on_device, quick_jit, small_agent
 
 ENV = Corridor()
-TRAINER = Trainer(small_agent(ENV, CONFIG))
+TRAINER = Trainer(small_agent(ENV, CORRIDOR_CONFIG))
 
 
 @functools.cache
@@ -30,12 +29,12 @@ def machine() -> Any:
 
 @functools.cache
 def banks(seed: int) -> TaskBanks:
-    return TaskBanks(seed, CONFIG.curriculum, ENV.num_propositions, np.zeros(0, np.uint32))
+    return TaskBanks(seed, CORRIDOR_CONFIG.curriculum, ENV.num_propositions, np.zeros(0, np.uint32))
 
 
 def held_out(seed: int) -> jax.Array:
     """Each seed has its own."""
-    return jnp.asarray(HELD_OUT.hashes[: seed + 1].repeat(3)[:3])
+    return jnp.asarray(CORRIDOR_HELD_OUT.hashes[: seed + 1].repeat(3)[:3])
 
 
 @functools.cache

@@ -24,6 +24,8 @@ from hrlspec.methods import Ours
 from hrlspec.spec import TaskTree, initial
 from hrlspec.tasks.rewards import RewardMachine, reward_machine
 from tests.probes import (
+    CORRIDOR_CONFIG,
+    CORRIDOR_HELD_OUT,
     Corridor,
     CorridorLayout,
     bank_of,
@@ -35,8 +37,6 @@ from tests.probes import (
     small_config,
     small_planner,
 )
-from tests.test_api import CONFIG as API_CONFIG
-from tests.test_api import HELD_OUT
 
 # a at 0, b at 4, c at 5; episodes start at 1, 2 or 3.
 ENV = Corridor()
@@ -45,11 +45,11 @@ CONFIG = small_config(
     network=dataclasses.replace(small_config().network, latent=32, encoder_mlp=(64,), critic=(64,), actor=(64,)),
 )
 TRAINER = Trainer(small_agent(ENV, CONFIG, network__hidden=32, network__features=32))
-QUICK = Trainer(small_agent(ENV, API_CONFIG))
+QUICK = Trainer(small_agent(ENV, CORRIDOR_CONFIG))
 """For what does not depend on how much is learned: the same program as the API's tests train with."""
 GAMMA = CONFIG.discount
 TASKS = ("a or b", "b or a", "achieve a", "a ensuring not b", "(a or b); c", "a; b", "a or b")
-NOTHING_RESERVED = np.zeros(len(HELD_OUT), np.uint32)
+NOTHING_RESERVED = np.zeros(len(CORRIDOR_HELD_OUT), np.uint32)
 
 
 def task(name: str) -> TaskTree:
