@@ -24,11 +24,17 @@ def circumstances() -> dict[str, Any]:
     return {
         "versions": {"hrlspec": __version__, "python": platform.python_version(), **versions},
         "commit": current_commit(),
-        "command": sys.argv,
+        "command": [_program(), *sys.argv[1:]],
         "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPUs",
         "devices": [str(device) for device in jax.devices()],
     }
+
+
+def _program() -> str:
+    """What this process runs, wherever the checkout lies."""
+    path, root = Path(sys.argv[0]), Path(__file__).parents[2]
+    return str(path.relative_to(root)) if path.is_relative_to(root) else path.name
 
 
 def current_commit() -> str | None:
