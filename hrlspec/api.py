@@ -8,7 +8,6 @@ Axes: **S** seeds trained in parallel.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -16,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float32, Key, Shaped, UInt32
+from jaxtyping import Key, Shaped, UInt32
 
 from envs_jax import Environment
 from envs_jax.arrays import Array
@@ -26,9 +25,9 @@ from hrlspec.agent.method import Method
 from hrlspec.agent_files import read_agent, read_params
 from hrlspec.config import evolve
 from hrlspec.evaluation import Suite, SuiteResult, evaluate_suite, suite_from_text
-from hrlspec.learning.train import Trainer, TrainState
+from hrlspec.learning.seeds import Seeds
+from hrlspec.learning.train import Trainer
 from hrlspec.presets import Preset, Recipe, RewardSet, preset, preset_for
-from hrlspec.spec import TaskTree
 from hrlspec.tasks.bank import TaskBanks, joint_labels, seed_of
 from hrlspec.tasks.rewards import RewardMachine
 
@@ -70,7 +69,8 @@ def train(
     """Trains an agent on a curriculum of random tasks (paper, "Algorithm").
 
     Args:
-        key: one key, or S keys for S agents trained in parallel (vmapped), each with the result of training alone.
+        key: one key, or S keys for S agents trained side by side, at once or, on a CPU, by turns; each with the result
+            of training alone.
         env: the name of a preset, or any environment; its settings are then chosen by its spaces.
         total_steps: environment steps for each agent; the preset's if not given.
         method: one of `hrlspec.methods.METHODS` by name, or a value of a `hrlspec.methods.Method`.
@@ -163,36 +163,22 @@ def _params(
     progress: Progress | None,
 ) -> Params:
     """Parameters after all iterations, for one key or S keys, each with its banks."""
-    config = trainer.agent.config
-    side_by_side = key.ndim > 0
-    init, iterate = (_init_all, _iterate_all) if side_by_side else (Trainer.init, Trainer.iterate)
-
-    def bank(iteration: int) -> TaskTree:
-        each = [some.at(iteration) for some in banks]
-        tree: TaskTree = jax.tree.map(lambda *x: jnp.stack(x), *each) if side_by_side else each[0]
-        return tree
-
-    state, held_out = init(trainer, key, bank(0), machine), jnp.asarray(reserved)
+    config, held_out = trainer.agent.config, jnp.asarray(reserved)
+    states = [trainer.init(one, some.at(0), machine) for one, some in zip(jnp.atleast_1d(key), banks, strict=True)]
+    several = Seeds(trainer, len(states)) if key.ndim else None
+    state = states[0] if several is None else several.join(states)
+    del states  # donated
     for i in range(config.num_iterations):
-        state, metrics = iterate(trainer, state, bank(i), machine, held_out)
+        bank = [some.at(i) for some in banks]
+        if several is None:
+            state, metrics = trainer.iterate(state, bank[0], machine, held_out)
+        else:
+            each = jax.tree.map(lambda *x: jnp.stack(x), *bank)
+            state, metrics = several.iterate(state, each, machine, jnp.stack([held_out] * several.number))
         if progress is not None:
             progress((i + 1) * config.steps_per_iteration, jax.device_get(metrics))
     params: Params = state.params
     return params
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _init_all(trainer: Trainer, keys: Key[Array, " S"], banks: TaskTree, machine: RewardMachine) -> TrainState:
-    """`Trainer.init` for S seeds, each with a bank of its own."""
-    return jax.vmap(trainer.init, in_axes=(0, 0, None))(keys, banks, machine)
-
-
-@functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
-def _iterate_all(
-    trainer: Trainer, states: TrainState, banks: TaskTree, machine: RewardMachine, reserved: UInt32[Array, " _"]
-) -> tuple[TrainState, dict[str, Float32[Array, " S"]]]:
-    """`Trainer.iterate` for S seeds."""
-    return jax.vmap(trainer.iterate, in_axes=(0, 0, None, None))(states, banks, machine, reserved)
 
 
 def _reserved(world: Preset, held_out: Suite | None) -> UInt32[np.ndarray, " _"]:
