@@ -49,7 +49,7 @@ COMPARISONS = {
         ),
         Comparison(
             "flatworld",
-            2_000_000,
+            15_000_000,
             ("deepltl/flatworld_finite", "deepltl/flatworld_infinite"),
             "a step leads up to 0.08 along each axis, theirs 0.08 in one of eight directions, so steps cannot be "
             f"compared; {_BUDGET.format('15 million')}; 500 episodes and five seeds",
