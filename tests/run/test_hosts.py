@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import resource
@@ -164,6 +165,21 @@ def test_zone_too(tmp_path: Path) -> None:
     with launched(tmp_path / "run", "--env", "zone") as launcher:
         assert launcher.wait() == 0, launcher.err
     assert_same(tmp_path / "run", in_one(tmp_path / "one" / "run", "--env", "zone"))
+
+
+def test_a_longer_run_compiles_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twice as many iterations and evaluations: nothing is compiled after warm-up, by the process that speaks."""
+    monkeypatch.setenv("JAX_LOG_COMPILES", "1")
+    compiled = []
+    for times in (1, 2):
+        folder = tmp_path / str(times) / "run"
+        monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(folder.parent / "compiled"))
+        with launched(folder, "--total-steps", str(times * tiny.TOTAL)) as launcher:
+            assert launcher.wait() == 0, launcher.err
+        words = launcher.err.split()
+        compiled.append(sorted(after for word, after in itertools.pairwise(words) if word == "Compiling"))
+    assert compiled[0]
+    assert compiled[1] == compiled[0]
 
 
 def test_a_signal_to_the_second_stops_both(alone: Path, tmp_path: Path) -> None:
