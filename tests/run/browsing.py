@@ -32,3 +32,8 @@ def in_the_way(tab: Any) -> list[Any]:
     bad = [(some["id"], some["nodes"][0]["html"]) for some in found if some["impact"] in ("serious", "critical")]
     fits = tab.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
     return bad if fits else [*bad, "wider than the screen"]
+
+
+def says(tab: Any, selector: str, text: str) -> None:
+    """Waits for the text. Playwright's `wait_for_function` may have to evaluate text, which the page forbids."""
+    playwright.expect(tab.locator(selector)).to_have_text(text, timeout=30_000)

@@ -15,7 +15,7 @@ import pytest
 
 from hrlspec.run.play.requests import Arrangement, Attempt
 from hrlspec.run.play.server import Server
-from tests.run.browsing import DESKTOP, PHONE, in_the_way, launched, needs_chromium
+from tests.run.browsing import DESKTOP, PHONE, in_the_way, launched, needs_chromium, says
 from tests.run.served import SEED, game, serving
 
 pytestmark = needs_chromium
@@ -115,7 +115,7 @@ def test_a_task_is_typed_a_letter_dragged_and_the_episode_watched(visit: Visit) 
     tab.locator("#speed").select_option("200")
     if not tab.evaluate("player.playing"):
         tab.locator("#play").click()
-    tab.wait_for_function(f"byId('clock').textContent === '{episode['steps']} / {episode['steps']}'")
+    says(tab, "#clock", f"{episode['steps']} / {episode['steps']}")
     tab.wait_for_selector("body:not(.playing)")
     xs, ys = episode["places"]
     assert tab.locator("#panels .agent").get_attribute("transform") == f"translate({xs[-1]:g} {ys[-1]:g})"

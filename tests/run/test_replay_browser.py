@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from hrlspec.run.replay.page import page
-from tests.run.browsing import DESKTOP, PHONE, in_the_way, launched, needs_chromium
+from tests.run.browsing import DESKTOP, PHONE, in_the_way, launched, needs_chromium, says
 from tests.run.replays import played
 
 pytestmark = needs_chromium
@@ -130,7 +130,7 @@ def test_it_plays_to_the_end_and_is_scrubbed_back(visit: Visit) -> None:
     length = max(run["episodes"][0]["steps"] for run in visit.data["runs"])
     visit.tab.locator("#speed").select_option("200")
     visit.tab.locator("#play").click()
-    visit.tab.wait_for_function(f"document.getElementById('clock').textContent === '{length} / {length}'")
+    says(visit.tab, "#clock", f"{length} / {length}")
     visit.tab.wait_for_selector("body:not(.playing)")
     check(visit, 0, length)
     visit.scrub(1)
