@@ -219,10 +219,12 @@ def iterations_of(places: Sequence[Place], what: str, flags: Flags) -> float:
     return statistics.mean(json.loads(text) for text in said)
 
 
-def measured(name: str, known: Mapping[str, Any], sums: Mapping[str, Any], flags: Flags) -> dict[str, Any]:
+def measured(
+    name: str, known: Mapping[str, Any], sums: Mapping[str, Any], flags: Flags, variables: Mapping[str, str]
+) -> dict[str, Any]:
     """Seconds of an iteration by number of environments on one core, and predicted and measured on two devices."""
     cores = sorted(os.sched_getaffinity(0))[:2]
-    apart, together = [Place(cores=[core]) for core in cores], [Place(cores=cores)]
+    apart, together = [Place(variables, [core]) for core in cores], [Place(variables, cores)]
     num_envs = known["num_envs"]
     cases = [(apart, f"{name}:1:{num_envs // 2}"), (apart, f"{name}:1:{num_envs}"), (together, f"{name}:2:{num_envs}")]
     turns = [[iterations_of(where, what, flags) for where, what in cases] for _ in range(flags.turns)]
@@ -277,13 +279,14 @@ def main() -> None:
         return
     if flags.measure and (sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2):
         raise UserError("measuring needs Linux and two cores; --no-measure predicts from shapes alone")
+    own = {"XLA_FLAGS": os.environ.get("XLA_FLAGS", "")}  # of processes that have devices of their own
     prepare(host_devices=2)
     sums = sum_seconds(flags.seconds) if flags.measure else None
     report: dict[str, Any] = {"benchmark": "scale_model", "recipe": flags.recipe, "sums": sums, "worlds": {}}
     for name in flags.envs:
         preset(name)  # there is one
         known = shapes(name, flags.recipe)
-        constants = None if sums is None else measured(name, known, sums, flags)
+        constants = None if sums is None else measured(name, known, sums, flags, own)
         report["worlds"][name] = {**known, "constants": constants, "predictions": predictions(known, constants, flags)}
     text = json.dumps({**report, **circumstances()}, indent=2)
     print(text)
