@@ -166,6 +166,7 @@ def _params(
     config, held_out = trainer.agent.config, jnp.asarray(reserved)
     states = [trainer.init(one, some.at(0), machine) for one, some in zip(jnp.atleast_1d(key), banks, strict=True)]
     several = Seeds(trainer, len(states)) if key.ndim else None
+    held_out = held_out if several is None else jnp.stack([held_out] * several.number)
     state = states[0] if several is None else several.join(states)
     del states  # donated
     for i in range(config.num_iterations):
@@ -174,7 +175,7 @@ def _params(
             state, metrics = trainer.iterate(state, bank[0], machine, held_out)
         else:
             each = jax.tree.map(lambda *x: jnp.stack(x), *bank)
-            state, metrics = several.iterate(state, each, machine, jnp.stack([held_out] * several.number))
+            state, metrics = several.iterate(state, each, machine, held_out)
         if progress is not None:
             progress((i + 1) * config.steps_per_iteration, jax.device_get(metrics))
     params: Params = state.params

@@ -29,9 +29,8 @@ from tests.probes import CORRIDOR_CONFIG, CORRIDOR_HELD_OUT, ITERATIONS, Corrido
 ENV = Corridor()
 METHOD = Ours(high=small_planner())
 STEPS_PER_ITERATION = 16 * 16
-CHANGES = {field.name: getattr(CORRIDOR_CONFIG, field.name) for field in dataclasses.fields(CORRIDOR_CONFIG)} | {
-    "total_steps": 1
-}
+SETTINGS = {field.name: getattr(CORRIDOR_CONFIG, field.name) for field in dataclasses.fields(CORRIDOR_CONFIG)}
+CHANGES = SETTINGS | {"total_steps": 1}
 SEEDS = (3, 8)
 
 History = list[tuple[int, dict[str, np.ndarray]]]
