@@ -22,7 +22,7 @@ from hrlspec.agent.agent import Agent
 from hrlspec.agent.experience import LowDecision, Outcome
 from hrlspec.agent.interaction import Worker, act, assign, start, transition
 from hrlspec.agent.low_level import Params, TaskBook
-from hrlspec.spec import TaskTree
+from hrlspec.spec import RUNNING, TaskTree
 from hrlspec.spec.automata import Automata
 from hrlspec.tasks.rewards import RewardMachine
 
@@ -39,6 +39,7 @@ class Episodes:
         steps: int32 ``[B]``, environment steps until the episode ended.
         returns: float32 ``[B]``, undiscounted sum of rewards.
         rounds: int32 ``[B]``, accepting transitions; 0 for tasks that do not go on for ever.
+        ended: bool ``[B]``, the environment ended the episode, and the task was neither satisfied nor violated by then.
     """
 
     success: Bool[Array, " B"]
@@ -46,6 +47,7 @@ class Episodes:
     steps: Int32[Array, " B"]
     returns: Float32[Array, " B"]
     rounds: Int32[Array, " B"]
+    ended: Bool[Array, " B"]
 
 
 @struct.dataclass
@@ -228,7 +230,7 @@ def _run(
     noise_scale = 0.0 if greedy else 1.0
     zeros = jnp.zeros(num_episodes, jnp.float32)
     none = zeros.astype(jnp.int32)
-    outcome = Episodes(success=zeros > 0, violated=zeros > 0, steps=none, returns=zeros, rounds=none)
+    outcome = Episodes(success=zeros > 0, violated=zeros > 0, steps=none, returns=zeros, rounds=none, ended=zeros > 0)
 
     def step(carry: tuple[Any, ...]) -> tuple[tuple[Any, ...], Any]:
         worker, outcome, running, time = carry
@@ -247,6 +249,7 @@ def _run(
             steps=outcome.steps + running,
             returns=outcome.returns + running * result.reward,
             rounds=outcome.rounds + (running & result.accepted),
+            ended=outcome.ended | (running & result.terminated & (worker.task_state.status == RUNNING)),
         )
         running &= ~(result.terminated | result.truncated)
         return (worker, outcome, running, time + 1), seen

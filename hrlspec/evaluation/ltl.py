@@ -76,8 +76,10 @@ class FormulaScore:
         silent: see `LtlSuite`.
         success_rate: of its episodes.
         violation_rate: nothing that could follow would have satisfied it, or the environment ended the episode.
+        ended_rate: the latter alone.
         steps_mean: of the successful episodes.
         rounds_mean: accepting transitions within the horizon; of tasks that go on for ever, which are never satisfied.
+        no_round_rate: none of them.
     """
 
     formula: str
@@ -86,8 +88,10 @@ class FormulaScore:
     silent: bool
     success_rate: Interval
     violation_rate: Interval
+    ended_rate: Interval
     steps_mean: Interval
     rounds_mean: Interval
+    no_round_rate: Interval
 
     def to_json(self) -> dict[str, Any]:
         """A dictionary for ``json.dumps``."""
@@ -98,8 +102,10 @@ class FormulaScore:
             "silent": self.silent,
             **interval_to_json("success_rate", self.success_rate),
             **interval_to_json("violation_rate", self.violation_rate),
+            **interval_to_json("ended_rate", self.ended_rate),
             **interval_to_json("steps_mean", self.steps_mean),
             **interval_to_json("rounds_mean", self.rounds_mean),
+            **interval_to_json("no_round_rate", self.no_round_rate),
         }
 
 
@@ -290,8 +296,8 @@ def evaluate_ltl(
 
 def _scores(suite: LtlSuite, which: Int[np.ndarray, " B"], episodes: Episodes) -> tuple[FormulaScore, ...]:
     """The scores of each formula."""
-    success, violated, steps, rounds = map(
-        np.asarray, (episodes.success, episodes.violated, episodes.steps, episodes.rounds)
+    success, violated, ended, steps, rounds = map(
+        np.asarray, (episodes.success, episodes.violated, episodes.ended, episodes.steps, episodes.rounds)
     )
     rows: Sequence[Bool[np.ndarray, " B"]] = [which == number for number in range(len(suite))]
     return tuple(
@@ -302,8 +308,10 @@ def _scores(suite: LtlSuite, which: Int[np.ndarray, " B"], episodes: Episodes) -
             silent=bool(suite.silent[number]),
             success_rate=rate_interval(success[mine]),
             violation_rate=rate_interval(violated[mine]),
+            ended_rate=rate_interval(ended[mine]),
             steps_mean=mean_interval(steps[mine & success]),
             rounds_mean=mean_interval(rounds[mine]),
+            no_round_rate=rate_interval(rounds[mine] == 0),
         )
         for number, (formula, mine) in enumerate(zip(suite.formulas, rows, strict=True))
     )

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import envs_jax
+from envs_jax.base import EnvParams, StepResult
+from envs_jax.letter.world import Letter, LetterState
 from hrlspec.evaluation import evaluate_ltl, exact_suite, ltl_suite, run_episodes
 from hrlspec.evaluation.episodes import _run, trace_episodes
 from hrlspec.presets.peers import go_on_for_ever, peer_formulas, peer_suites
@@ -148,6 +150,7 @@ def test_rounds_of_a_task_that_goes_on() -> None:
         assert rounds > 3
     found = evaluate_ltl(KEY, WALKER, manner(), COMPLETION, suite, episodes=COUNT, greedy=True)
     assert found.to_json()["rounds_mean"] == found.rounds_mean > 3
+    assert found.per_formula[0].no_round_rate.estimate == 0
 
 
 def test_a_suite_of_formulas() -> None:
@@ -164,6 +167,30 @@ def test_a_suite_of_formulas() -> None:
     json.dumps(found.to_json(), allow_nan=False)
     again = evaluate_ltl(KEY, WALKER, manner(), COMPLETION, suite, episodes=40, greedy=True, chunk=COUNT)
     assert [score.success_rate for score in again.per_formula] == [score.success_rate for score in found.per_formula]
+
+
+class Ending(Letter):
+    """It ends every episode with the third step."""
+
+    def step_env(self, key: jax.Array, state: LetterState, action: jax.Array, params: EnvParams) -> StepResult:
+        observation, after, reward, _, truncated, info = super().step_env(key, state, action, params)
+        return observation, after, reward, after.time >= 3, truncated, info
+
+
+@pytest.mark.parametrize("ends", [False, True])
+def test_how_episodes_fail(ends: bool) -> None:
+    """Violated, or over: by the environment or with the horizon. What the last step satisfies is a success."""
+    env = Ending() if ends else Letter(horizon=3)
+    suite = ltl_suite("some", "false\nX X true\nX X X true", env)
+    found = evaluate_ltl(KEY, walker(env), manner(), COMPLETION, suite, episodes=8, greedy=True)
+
+    def each(name: str) -> list[float]:
+        return [getattr(score, name).estimate for score in found.per_formula]
+
+    assert each("success_rate") == [0, 1, 0]
+    assert each("ended_rate") == [0, 0, ends]
+    assert each("violation_rate") == [1, 0, ends]
+    assert found.steps_mean == 3
 
 
 def test_another_formula_needs_no_compilation() -> None:

@@ -26,6 +26,7 @@ EPISODES = Episodes(
     steps=np.array([2, 8, 3, 5], np.int32),
     returns=np.array([1.0, 1.0, 0.5, 2.0], np.float32),
     rounds=np.zeros(4, np.int32),
+    ended=np.zeros(4, bool),
 )
 MACHINE = reward_machine(LETTERS, subtask=0.5)
 CASES = Cases(
@@ -76,7 +77,12 @@ def test_depths_and_tasks_by_hand():
 def _outcomes(success: np.ndarray, steps: np.ndarray) -> Episodes:
     returns = success.astype(np.float32)
     return Episodes(
-        success=success, violated=~success, steps=steps.astype(np.int32), returns=returns, rounds=np.zeros_like(steps)
+        success=success,
+        violated=~success,
+        steps=steps.astype(np.int32),
+        returns=returns,
+        rounds=np.zeros_like(steps),
+        ended=~success,
     )
 
 

@@ -122,7 +122,7 @@ def _long(horizon: int, num_episodes: int) -> tuple[np.ndarray, list[Played]]:
     high = Deliberation(np.zeros(lead, bool), np.ones(lead, int), nothing > 0, nothing[..., 0], nothing, nothing)
     record = Record(np.ones(lead, bool), standing, standing, high, nothing, draw.random(lead), np.zeros(lead))
     none = np.zeros(num_episodes)
-    ended = Episodes(none > 0, none > 0, np.full(num_episodes, horizon), none, none)
+    ended = Episodes(none > 0, none > 0, np.full(num_episodes, horizon), none, none, none > 0)
     return layouts, [Played(name, "drawn", ended, record) for name in ("one", "other")]
 
 

@@ -122,9 +122,9 @@ def test_several_seeds(iqm: Interval | None) -> None:
 
 def test_formulas_in_ltl() -> None:
     """Marks say what the agent was not shown; of tasks for ever rounds count."""
-    rate, none = Interval(0.9, 0.8, 0.95), Interval(NAN, NAN, NAN)
+    rate, few, none = Interval(0.9, 0.8, 0.95), Interval(0.05, 0, 0.1), Interval(NAN, NAN, NAN)
     scores = tuple(
-        FormulaScore(text, 5, cut, silent, rate, Interval(0.05, 0, 0.1), Interval(12.5, 12, 13), Interval(2.5, 2, 3))
+        FormulaScore(text, 5, cut, silent, rate, few, few, Interval(12.5, 12, 13), Interval(2.5, 2, 3), few)
         for text, cut, silent in (("F a", False, False), ("F b", True, False), ("F c", False, True))
     )
     finite, forever = (
