@@ -10,10 +10,10 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments.paper.making import command, make
+from experiments.paper.making import command, made, make
 from experiments.paper.panels import NUM_SEEDS
-from experiments.paper.records import read_records, record_of
-from experiments.published.comparisons import COMPARISONS
+from experiments.paper.records import read_records
+from experiments.published.comparisons import COMPARISONS, Comparison
 from experiments.published.evaluations import Evaluation, evaluate, read_evaluations
 from experiments.published.report import page
 from hrlspec.config import setting
@@ -22,6 +22,7 @@ from hrlspec.run.console import PlainConsole
 from hrlspec.run.engines import EngineFlags, engine_of
 from hrlspec.run.errors import UserError
 from hrlspec.run.flags import parse_flags
+from hrlspec.run.folder import check_writable
 from hrlspec.run.signals import leave
 
 
@@ -62,23 +63,37 @@ def main(argv: Sequence[str], *, program: str = "hrlspec peers") -> None:
     work = flags.work or (flags.out / "runs" if flags.out else Path("runs/peers"))
     console = PlainConsole(stderr=True)
     asked = [comparison for name, comparison in COMPARISONS.items() if name in (flags.only or COMPARISONS)]
-    wanted = [Evaluation(run, suite) for some in asked for run in some.runs(flags.seeds) for suite in some.suites]
+    wanted = _evaluations(asked, flags.seeds)
     known = read_evaluations(wanted, out)
     missing = [one for one in wanted if one not in known]
-    runs = list(dict.fromkeys(one.run for one in missing if record_of(work / one.run.name) is None))
+    agents = list(dict.fromkeys(one.run for one in missing))
+    recorded = read_records(agents, out)
+    # One that is finished and has no record was stopped in between: made again it is found finished, and recorded.
+    runs = [run for run in agents if run not in recorded or made(run, work) is None]
     console.say(f"{len(wanted)} evaluations, {len(missing)} of them missing, and {len(runs)} runs for them")
     if flags.dry_run:
         for run in runs:
             print(command(run, work))
         return
+    for folder in (out, work):
+        check_writable(folder)
     if runs:
         make(runs, work=work, records=out, engine=engine, console=console)
+    for run in agents:
+        if made(run, work) is None:
+            what = f"another run of that name than the one of {run.total_steps:,} steps that is asked for"
+            raise UserError(f"{work / run.name} holds {what}; move it away, and the same command makes this one")
     for done in evaluate(missing, work=work, folder=out, jobs=flags.jobs):
         console.say(f"evaluated: {done.run.name} on {done.suite}")
-    every = [Evaluation(run, suite) for some in COMPARISONS.values() for run in some.runs() for suite in some.suites]
+    # The page is about all that is known, whatever was asked for now.
+    every = _evaluations([*COMPARISONS.values()], max(flags.seeds, NUM_SEEDS))
     scores, records = read_evaluations(every, out), read_records({one.run for one in every}, out)
     (out / "peers.md").write_text("\n".join(page(records, scores)) + "\n")
     console.say(f"written: {out / 'peers.md'}")
+
+
+def _evaluations(comparisons: Sequence[Comparison], seeds: int) -> list[Evaluation]:
+    return [Evaluation(run, suite) for some in comparisons for run in some.runs(seeds) for suite in some.suites]
 
 
 if __name__ == "__main__":

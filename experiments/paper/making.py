@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments.paper.panels import Run
-from experiments.paper.records import add_record, read_records, record_of
+from experiments.paper.records import Record, add_record, read_records, record_of
 from hrlspec.run.console import PlainConsole
 from hrlspec.run.engines import Engine, carry_out, failures
 from hrlspec.run.planned import PlannedRun
@@ -31,13 +31,24 @@ def make(runs: Sequence[Run], *, work: Path, records: Path, engine: Engine, cons
 
     def keep(plan: PlannedRun) -> None:
         """Adds the record, but for a run that was made again because its checkpoint was gone."""
-        run, record = by_plan[plan], record_of(plan.folder)
+        run = by_plan[plan]
+        record = made(run, work)
         if record is not None and run not in read_records([run], records):
             add_record(run, record, records)
 
     failed = carry_out([*by_plan], engine, console, keep)
     if failed:
         raise SystemExit(f"error: {failures(failed)}")
+
+
+def made(run: Run, work: Path) -> Record | None:
+    """The record of a run in its folder; ``None`` if it is not finished, or of another number of steps.
+
+    Raises:
+        UserError: the folder is damaged.
+    """
+    record = record_of(work / run.name)
+    return record if record is not None and record.settings["config"]["total_steps"] == run.total_steps else None
 
 
 def planned(run: Run, work: Path) -> PlannedRun:

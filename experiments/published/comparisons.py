@@ -71,7 +71,7 @@ COMPARISONS = {
             10_000_000,
             ("deepltl/zone_finite", "deepltl/zone_infinite"),
             "the robot's physics is MuJoCo MJX's instead of MuJoCo's; theirs act greedily on finite formulas, with 500 "
-            f"episodes and five seeds; {_BUDGET.format('15 million')}",
+            f"episodes and five seeds (Transformer three); {_BUDGET.format('15 million')}",
         ),
         *(
             Comparison(f"{series}-{k}", 500_000, ("dag",), _CHAINS)

@@ -290,7 +290,8 @@ from hrlspec.run.folder import open_run
 folder, row = pathlib.Path(sys.argv[1]), dict.fromkeys(sys.argv[3:], 0.5)
 signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
 signal.alarm(300)  # it never outlives its test
-with open_run(folder, {"seed": 0}, resume=sys.argv[2] == "resume", tensorboard=False) as run:
+settings = {"seed": 0, "config": {"total_steps": 1_500_000}}
+with open_run(folder, settings, resume=sys.argv[2] == "resume", tensorboard=False) as run:
     if run.resumed:
         run.rewind(50)
         run.append({**row, "env_steps": 100})
