@@ -29,6 +29,7 @@ from hrlspec.tasks.rewards import RewardMachine
 MAX_NODES = 64
 """Default for the trees that the states of automata show: of larger ones the longest paths are left out."""
 _LEAST_ROWS = 32
+_LAYOUT_STREAM = 2**31 - 1  # far from the keys that training with the same seed begins with
 EPISODES = 512
 """Of each formula, as the peers have it."""
 
@@ -275,7 +276,7 @@ def evaluate_ltl(
         chunk: episodes run in parallel; bounds memory.
     """
     which = np.repeat(np.arange(len(suite)), episodes)
-    layout_keys = jax.random.split(jax.random.key(seed), len(which))
+    layout_keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), _LAYOUT_STREAM), len(which))
     layouts = jax.vmap(agent.env.sample_layout, in_axes=(0, None))(layout_keys, agent.env.default_params)
     found = jax.device_get(
         run_episodes(

@@ -11,8 +11,8 @@ import pytest
 import envs_jax
 from envs_jax.base import EnvParams, StepResult
 from envs_jax.letter.world import Letter, LetterState
-from hrlspec.evaluation import evaluate_ltl, exact_suite, ltl_suite, run_episodes
-from hrlspec.evaluation.episodes import _run, trace_episodes
+from hrlspec.evaluation import evaluate_ltl, exact_suite, ltl, ltl_suite, run_episodes
+from hrlspec.evaluation.episodes import Episodes, _run, trace_episodes
 from hrlspec.presets.peers import go_on_for_ever, peer_formulas, peer_suites
 from hrlspec.spec import SpecError, compile_task, parse
 from hrlspec.spec.automata import Automata, automata_of
@@ -167,6 +167,24 @@ def test_a_suite_of_formulas() -> None:
     json.dumps(found.to_json(), allow_nan=False)
     again = evaluate_ltl(KEY, WALKER, manner(), COMPLETION, suite, episodes=40, greedy=True, chunk=COUNT)
     assert [score.success_rate for score in again.per_formula] == [score.success_rate for score in found.per_formula]
+
+
+def test_episodes_and_seeds_have_layouts_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """None that another episode or seed has, and none drawn with a key that training with that seed begins with."""
+    seen: list[np.ndarray] = []
+
+    def noted(key: jax.Array, *args: object, **how: object) -> Episodes:
+        seen.append(np.asarray(args[4]))
+        none = np.zeros(len(seen[-1]), np.int32)
+        return Episodes(none > 0, none > 0, none, none, none, none > 0)
+
+    monkeypatch.setattr(ltl, "run_episodes", noted)
+    suite = ltl_suite("some", "F a\nF b", LETTER)
+    for seed in range(3):
+        evaluate_ltl(KEY, WALKER, manner(), COMPLETION, suite, episodes=COUNT, seed=seed)
+        first = jax.random.split(jax.random.key(seed), 2 * COUNT)
+        seen.append(np.asarray(jax.vmap(LETTER.sample_layout, (0, None))(first, LETTER.default_params)))
+    assert len({layout.tobytes() for layouts in seen for layout in layouts}) == 6 * 2 * COUNT
 
 
 class Ending(Letter):
