@@ -16,6 +16,7 @@ from experiments.published.comparisons import COMPARISONS, EPISODES, Comparison
 from experiments.published.evaluations import Scores
 from hrlspec.evaluation.stats import Interval, mean_interval
 from hrlspec.presets.peers import go_on_for_ever, peer_formulas
+from hrlspec.run.configuration import config_hash
 from hrlspec.run.progress import duration
 
 PUBLISHED = Path(__file__).with_name("published.csv")
@@ -112,6 +113,9 @@ def _world(
     if known:
         machines = " and ".join(sorted({str(record.circumstances["machine"]) for record in known}))
         yield f"Training took {duration(float(np.mean([record.wall_s for record in known])))} on average ({machines})."
+    different = {config_hash({**record.settings, "seed": None}) for record in known}
+    if len(different) > 1:
+        yield f"**The runs are of {len(different)} different settings**, which their records tell."
     yield f"What differs: {comparison.differs}."
     for suite, some in found.items():
         yield ""

@@ -59,6 +59,8 @@ def ltl_table(result: LtlResult) -> Table:
     """Success, violations and steps of each formula, and their means."""
     remarks = ["greedy actions" if result.greedy else "sampled actions", "95 % intervals over episodes"]
     remarks.append("rounds within the horizon" if result.forever else "steps of successful episodes")
+    if any(score.ended_rate.estimate > 0 for score in result.per_formula):
+        remarks.append("violated, or ended by the environment")
     if any(score.cut for score in result.per_formula):
         remarks.append("* some paths to acceptance were left out, for a tree was too small")
     if any(score.silent for score in result.per_formula):

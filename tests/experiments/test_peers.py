@@ -34,8 +34,8 @@ def scored(suite: str, success: float, steps: float | None) -> dict[str, Any]:
     return {"per_formula": [{"formula": formula, **marks, **row} for formula in formulas]}
 
 
-def record(wall_s: float) -> Record:
-    return Record({}, {"machine": "a small one"}, env_steps=1, wall_s=wall_s, curve={}, final={})
+def record(wall_s: float, **settings: object) -> Record:
+    return Record(settings, {"machine": "a small one"}, env_steps=1, wall_s=wall_s, curve={}, final={})
 
 
 def test_every_suite_is_there() -> None:
@@ -61,7 +61,7 @@ def test_page() -> None:
     rates = zip(runs, (0.9, 1.0, 0.95), strict=True)
     scores = {Evaluation(run, suite): scored(suite, success, 8.0) for run, success in rates}
     scores[Evaluation(runs[0], "deepltl/letter_infinite")] = scored("deepltl/letter_infinite", 0.5, None)
-    lines = list(page({run: record(60.0) for run in runs}, scores))
+    lines = list(page({run: record(60.0, seed=run.seed) for run in runs}, scores))
     # Three seeds: mean 0.95, standard error 0.05 / sqrt(3), Student's t with two degrees of freedom 4.303.
     # It ends above 1, where no rate is.
     low = 0.95 - 4.3027 * 0.05 / 3**0.5
@@ -75,6 +75,9 @@ def test_page() -> None:
     assert any("`((a \\| b \\| c \\| d) => " in line for line in lines)
     assert "Training took 1:00 on average (a small one)." in lines
     assert not any(line.startswith("## flatworld") for line in lines)
+    assert not any("different settings" in line for line in lines)
+    mixed = {run: record(60.0, seed=run.seed, epochs=run.seed // 2) for run in runs}
+    assert any("The runs are of 2 different settings" in line for line in page(mixed, scores))
 
 
 def test_rows_of_means_are_over_the_same_formulas() -> None:

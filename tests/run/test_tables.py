@@ -134,6 +134,9 @@ def test_formulas_in_ltl() -> None:
     assert "F c†" in finite
     assert "0.900 [.80,.95]" in finite
     assert "rounds" not in finite
+    assert "ended by the environment" in " ".join(finite.split())
+    kept = tuple(dataclasses.replace(score, ended_rate=Interval(0, 0, 0.1)) for score in scores)
+    assert "ended by" not in "\n".join(lines(ltl_table(LtlResult("some", False, False, 512, kept))))
     assert "2.500 [2.00,3.00]" in forever
     assert "success" not in forever
     assert LtlResult("some", True, False, 512, scores).to_json()["success_rate"] is None
