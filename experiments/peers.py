@@ -21,6 +21,7 @@ from hrlspec.run.cli import call
 from hrlspec.run.console import PlainConsole
 from hrlspec.run.engines import EngineFlags, engine_of
 from hrlspec.run.errors import UserError
+from hrlspec.run.files import write_atomically
 from hrlspec.run.flags import parse_flags
 from hrlspec.run.folder import check_writable
 from hrlspec.run.signals import leave
@@ -88,7 +89,7 @@ def main(argv: Sequence[str], *, program: str = "hrlspec peers") -> None:
     # The page is about all that is known, whatever was asked for now.
     every = _evaluations([*COMPARISONS.values()], max(flags.seeds, NUM_SEEDS))
     scores, records = read_evaluations(every, out), read_records({one.run for one in every}, out)
-    (out / "peers.md").write_text("\n".join(page(records, scores)) + "\n")
+    write_atomically(out / "peers.md", "\n".join(page(records, scores)) + "\n")
     console.say(f"written: {out / 'peers.md'}")
 
 

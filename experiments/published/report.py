@@ -112,7 +112,8 @@ def _world(
     yield f"{comparison.steps:,} environment steps a seed."
     if known:
         machines = " and ".join(sorted({str(record.circumstances["machine"]) for record in known}))
-        yield f"Training took {duration(float(np.mean([record.wall_s for record in known])))} on average ({machines})."
+        seconds = float(np.mean([record.wall_s for record in known]))
+        yield f"Training took {duration(seconds)} on average, compilation and evaluations included ({machines})."
     different = {config_hash({**record.settings, "seed": None}) for record in known}
     if len(different) > 1:
         yield f"**The runs are of {len(different)} different settings**, which their records tell."

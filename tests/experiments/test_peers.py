@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from experiments import peers
 from experiments.paper.making import made
 from experiments.paper.records import Record, add_record
 from experiments.peers import main
@@ -73,7 +74,7 @@ def test_page() -> None:
     assert "| DeepLTL | GCRL-LTL ‡ | LTL2Action ‡ |" in next(line for line in lines if line.startswith("| formula"))
     assert any(line.startswith("| `GF (e & (!a U f))` | 5.00 | 0.500 | 0.030 | 0.010 |") for line in lines)
     assert any("`((a \\| b \\| c \\| d) => " in line for line in lines)
-    assert "Training took 1:00 on average (a small one)." in lines
+    assert "Training took 1:00 on average, compilation and evaluations included (a small one)." in lines
     assert not any(line.startswith("## flatworld") for line in lines)
     assert not any("different settings" in line for line in lines)
     mixed = {run: record(60.0, seed=run.seed, epochs=run.seed // 2) for run in runs}
@@ -211,6 +212,28 @@ def test_only_the_run_that_is_asked_for_counts_as_made(
     out, err = capsys.readouterr()
     assert err == f"1 evaluations, 1 of them missing, and {to_make} runs for them\n"
     assert len(out.splitlines()) == to_make
+
+
+def test_from_finished_runs_to_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is known is not evaluated again; of a run of another length nothing is said."""
+    (run,) = COMPARISONS["conveyor-2"].runs(1)
+    finished(tmp_path / "runs" / run.name, run.total_steps)
+    record = made(run, tmp_path / "runs")
+    assert record is not None
+    add_record(run, record, tmp_path)
+    found = {"success_rate": 1.0, "steps_mean": 11.0, "optimal_steps_mean": 11.0}
+    monkeypatch.setattr(evaluations, "_scores", lambda *_: found)
+    flags = ["--only", "conveyor-2", "--seeds", "1", "--out", str(tmp_path), "--jobs", "1"]
+    main(flags)
+    assert "| 2 | 1 | 1.000 | 11.0 | 11 |" in (tmp_path / "peers.md").read_text()
+    monkeypatch.setattr(evaluations, "_scores", lambda *_: pytest.fail("evaluated again"))
+    main(flags)
+    finished(tmp_path / "longer" / run.name, run.total_steps + 1)
+    (tmp_path / FILE).unlink()
+    monkeypatch.setattr(peers, "make", lambda *_, **__: None)
+    with pytest.raises(UserError, match="holds another run of that name than the one of 500,000 steps"):
+        main([*flags, "--work", str(tmp_path / "longer")])
+    assert not (tmp_path / FILE).exists()
 
 
 def test_dry_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
