@@ -17,11 +17,13 @@ from typing import Any, NamedTuple
 
 from experiments.paper.panels import Run
 from experiments.published.comparisons import EPISODES
+from hrlspec.presets.peers import peer_formulas, peer_suites
 from hrlspec.run.circumstances import current_commit
 from hrlspec.run.console import counted
 from hrlspec.run.errors import UserError
 from hrlspec.run.places import Place, places, tethered
 from hrlspec.run.planned import problem_of
+from hrlspec.spec import bare_lines
 
 FILE = "evaluations.jsonl"
 
@@ -77,11 +79,16 @@ def _checked(suite: str, scores: dict[str, Any]) -> dict[str, Any]:
     Raises:
         KeyError: something that is used is missing.
         TypeError: they are nothing of the kind.
+        ValueError: the suite has other formulas now.
     """
     rows, names = (scores["per_formula"], OF_FORMULA) if "/" in suite else ([scores], OF_CHAINS)
     for row in rows:
         for name in names:
             row[name]
+    if suite in peer_suites():
+        formulas = [" ".join(line.split()) for line in bare_lines(peer_formulas(suite)) if line.strip()]
+        if [row["formula"] for row in rows] != formulas:
+            raise ValueError(f"{suite} has other formulas now")
     return scores
 
 

@@ -128,6 +128,14 @@ def test_known_evaluations(tmp_path: Path) -> None:
 _LINE = {"run": "a", "asked_steps": 1, "suite": "dag"}
 
 
+def test_evaluations_of_formulas_that_a_suite_had_before(tmp_path: Path) -> None:
+    scores = scored("deepltl/letter_infinite", 0.5, None)
+    line = _LINE | {"suite": "deepltl/letter_infinite", "scores": {"per_formula": scores["per_formula"][:1]}}
+    (tmp_path / FILE).write_text(json.dumps(line) + "\n")
+    with pytest.raises(UserError, match="deepltl/letter_infinite has other formulas now"):
+        read_evaluations([], tmp_path)
+
+
 @pytest.mark.parametrize(
     "text",
     [
