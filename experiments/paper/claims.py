@@ -6,6 +6,8 @@ Together, in all their panels and under all recipes, they are one family of test
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -146,6 +148,15 @@ def family() -> list[Test]:
     """All tests that are to be made, whether or not their runs are there."""
     every = [Test(claim, panel, recipe) for claim in CLAIMS for panel in claim.panels for recipe in RECIPES]
     return [test for test in every if {*test.sides} <= {*PANELS[test.panel].curves}]
+
+
+def runs_to_decide() -> int:
+    """The fewest runs on either side with which a claim can have a verdict.
+
+    The least p-value of the exact test is 2 in the number of ways to divide the runs, and Holm's correction multiplies
+    it by the size of the family.
+    """
+    return next(runs for runs in itertools.count(2) if 2 * len(family()) / math.comb(2 * runs, runs) < LEVEL)
 
 
 def findings(by_panel: Mapping[str, Records]) -> dict[Test, Finding]:

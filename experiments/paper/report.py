@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -18,6 +19,7 @@ from experiments.paper.claims import (
     findings,
     mean_return,
     over_seeds,
+    runs_to_decide,
     steps_to_most,
 )
 from experiments.paper.panels import (
@@ -48,17 +50,19 @@ instance. The ratio is of the steps that ours takes to 90 % of its curve's last 
 are interquartile means over seeds (training: means) with stratified bootstrap intervals (95 %); bands are Student's t
 intervals. All methods run through the same loop, with the same curriculum and, but for No-ER, relabelling. Recipe
 `paper` collects with the shield, also for Option; LTL2Action has no sub-task and so nothing to shield. Recipe `hrlspec`
-has no shield. The records that are kept are of the first drawing of the suites, on whose tasks settings were chosen as
-well; tasks for validation and test have since been drawn anew, apart from each other. Training times are of runs side
-by side, one on each core, with compilation and evaluations; a few include a pause or other programs beside them."""
+has no shield. The records are of [older code](#code) and of the first drawing of the suites, on whose tasks settings
+were chosen as well; tasks for validation and test have since been drawn anew, apart from each other. Training times, in
+minutes and seconds, are of runs side by side, one on each core, with compilation and evaluations; a few include a pause
+or other programs beside them."""
 _ABOUT_CLAIMS = """\
 Means over seeds are compared: of the curve's mean where the claim is about learning, of the final return where it is
 about the end. The difference has Welch's 95 % interval; the share is the probability that a run of the one beats a run
 of the other, with a bootstrap interval. p is that of the two-sided exact permutation test, corrected by Holm's method
 for all claims in all panels under all recipes, {family} tests, also those whose runs are not there yet. A claim holds,
-or does not, where the corrected p is below {level}. Recipe `planner` is compared with the baselines under recipe
-`paper`, of which it is a variant. For claims that do not hold, experiments that look for the reason are in
-`docs/decisions.md`, "Where claims do not hold"."""
+or does not, where the corrected p is below {level}. That takes {enough} runs on either side: with fewer, p is never
+small enough, however far apart the runs are. Recipe `planner` is compared with the baselines under recipe `paper`, of
+which it is a variant. Experiments that look for reasons where a claim does not hold, or is undecided, are in
+[decisions](decisions.md#where-claims-do-not-hold)."""
 
 
 def write_report(panels: Sequence[Panel], records: Mapping[Run, Record], figures: Path, report: Path) -> Iterator[Path]:
@@ -79,7 +83,7 @@ def write_report(panels: Sequence[Panel], records: Mapping[Run, Record], figures
             yield _draw(panel, found, figures / f"{panel.name}.png")
     report.parent.mkdir(parents=True, exist_ok=True)
     page = _page(by_panel, Path(os.path.relpath(figures, report.parent)), report)
-    report.write_text("\n".join([*page, *_times(by_panel), *_tuning(tuning)]) + "\n")
+    report.write_text("\n".join([*page, *_times(by_panel), *_sources(records), *_tuning(tuning)]) + "\n")
     yield report
 
 
@@ -129,7 +133,7 @@ def _page(by_panel: Mapping[Panel, Records], figures: Path, report: Path) -> Ite
     yield ""
     yield "## The paper's claims"
     yield ""
-    yield _ABOUT_CLAIMS.format(family=len(family()), level=LEVEL)
+    yield _ABOUT_CLAIMS.format(family=len(family()), level=LEVEL, enough=runs_to_decide())
     yield ""
     yield "| claim | panel | recipe | difference | share | p | corrected | seeds | verdict |"
     yield "|---|---|---|---|---|---|---|---|---|"
@@ -143,11 +147,7 @@ def _page(by_panel: Mapping[Panel, Records], figures: Path, report: Path) -> Ite
         yield ""
         yield f"![{panel.title}]({(figures / panel.name).as_posix()}.png)"
         yield ""
-        scores = ("success", "steps", "SPL", "first choice", "contested", "of optimum")
-        columns = ("curve", "seeds", "final return", *scores, "mean of the curve", "steps to 90 %", "ratio")
-        yield f"| {' | '.join(columns)} | training |"
-        yield "|---" * (len(columns) + 1) + "|"
-        yield from _rows(records)
+        yield from _table(records)
     if (report.parent / figures / f"{TRAJECTORIES}.png").exists():
         yield ""
         yield "## Walk, trajectories"
@@ -179,6 +179,24 @@ def _times(by_panel: Mapping[Panel, Records]) -> Iterator[str]:
         yield f"| {panel.name} | {' | '.join(cells)} |"
 
 
+def _sources(records: Mapping[Run, Record]) -> Iterator[str]:
+    """Which code the runs were made with."""
+    commits: dict[tuple[str, str], collections.Counter[str]] = {}
+    for run, record in records.items():
+        known, _, changes = str(record.circumstances["commit"]).partition("+")
+        where = commits.setdefault((run.env, run.curve.recipe), collections.Counter())
+        where[f"`{known[:7]}`" + (" and changes" if changes else "")] += 1
+    yield ""
+    yield "## Code"
+    yield ""
+    yield "The commits that the runs were made with, and how many of them; some had changes that were not committed."
+    yield ""
+    yield "| environment | recipe | commits |"
+    yield "|---|---|---|"
+    for (env, recipe), counted in commits.items():
+        yield f"| {env} | {recipe} | {', '.join(f'{commit} ({runs})' for commit, runs in counted.items())} |"
+
+
 def _tuning(trials: Mapping[Panel, Records]) -> Iterator[str]:
     """What was tried for each method, and what came of it."""
     if not trials:
@@ -198,24 +216,38 @@ def _tuning(trials: Mapping[Panel, Records]) -> Iterator[str]:
             yield f"| {panel.env} | {curve.label} | {len(some)} | {learning:.3f} | {final:.3f} |"
 
 
-def _rows(records: Records) -> Iterator[str]:
-    """A line for each curve; the ratio is of ours' steps to its own."""
+def _table(records: Records) -> Iterator[str]:
+    """A line for each curve; the ratio is of ours' steps to its own. Scores that are known of none are left out."""
     ours = {recipe: records.get(Curve("ours", recipe)) for recipe in RECIPES}
     fastest = {recipe: over_seeds(steps_to_most, some).estimate for recipe, some in ours.items() if some}
+    scores = {curve: _scores(some) for curve, some in records.items()}
+    known = [name for name in next(iter(scores.values())) if any(some[name] for some in scores.values())]
+    columns = ("curve", "seeds", "final return", *known, "mean of the curve", "steps to 90 %", "ratio", "training")
+    yield f"| {' | '.join(columns)} |"
+    yield "|---" * len(columns) + "|"
     for curve, some in records.items():
         steps = over_seeds(steps_to_most, some).estimate
         ratio = f"{fastest[curve.recipe] / steps:.2f}" if curve.recipe in fastest else ""
-        suites = [record.final["suite"] for record in some]
-        contested = [record.final.get("contested_choice") or {} for record in some]
-        first = [record.final.get("first_choice") or {} for record in some]
-        optimum = [record.final.get("return_over_optimum") or {} for record in some]
-        scores = [_mean(suites, "success_rate"), _mean(suites, "steps_mean", ".0f"), _mean(suites, "spl")]
-        scores += [_mean(first, "first_choice"), _mean(contested, "contested_choice")]
-        scores += [_mean(optimum, "return_over_optimum")]
         wall = duration(float(np.mean([record.wall_s for record in some])))
-        final = " | ".join([str(over_seeds(final_return, some)), *scores])
+        final = " | ".join([str(over_seeds(final_return, some)), *(scores[curve][name] for name in known)])
         learning = f"{over_seeds(mean_return, some)} | {steps:,.0f} | {ratio} | {wall}"
         yield f"| {curve.label} | {len(some)} | {final} | {learning} |"
+
+
+def _scores(records: Sequence[Record]) -> dict[str, str]:
+    """Those at the end, by their column; empty where they are not known."""
+    suite, first, contested, optimum = (
+        [record.final.get(name) or {} for record in records]
+        for name in ("suite", "first_choice", "contested_choice", "return_over_optimum")
+    )
+    return {
+        "success": _mean(suite, "success_rate"),
+        "steps": _mean(suite, "steps_mean", ".0f"),
+        "SPL": _mean(suite, "spl"),
+        "first choice": _mean(first, "first_choice"),
+        "contested": _mean(contested, "contested_choice"),
+        "of optimum": _mean(optimum, "return_over_optimum"),
+    }
 
 
 def _mean(results: Sequence[Mapping[str, Any]], name: str, how: str = ".3f") -> str:
