@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from rich import box
 from rich.table import Table
@@ -138,12 +138,19 @@ def plain_table(title: str, columns: Sequence[str], caption: str | None = None) 
 
 
 def cell(interval: Interval | None) -> str:
-    """The estimate and its bounds, such as ``0.983 [.97,.99]``."""
+    """The estimate and its bounds, such as ``0.983 [.97,.99]``, rounded outwards: the estimate is never outside."""
     if interval is None or math.isnan(interval.estimate):
         return "-"
     large = abs(interval.estimate) >= 10
     estimate = f"{interval.estimate:.{1 if large else 3}f}"
     if math.isnan(interval.low):
         return estimate
-    low, high = (f"{bound:.1f}" if large else re.sub(r"^(-?)0\.", r"\1.", f"{bound:.2f}") for bound in interval[1:])
+    digits = 1 if large else 2
+    bounds = [_rounded(interval.low, digits, math.floor), _rounded(interval.high, digits, math.ceil)]
+    low, high = bounds if large else [re.sub(r"^(-?)0\.", r"\1.", bound) for bound in bounds]
     return f"{estimate} [{low},{high}]"
+
+
+def _rounded(bound: float, digits: int, outwards: Callable[[float], int]) -> str:
+    """A bound with so many digits; what is a rounding error of the number itself moves it nowhere."""
+    return f"{outwards(round(bound * 10**digits, 6)) / 10**digits:.{digits}f}"

@@ -22,7 +22,7 @@ from hrlspec.evaluation import (
 from hrlspec.evaluation.stats import Interval
 from hrlspec.run.console import PlainConsole
 from hrlspec.run.learner import FinalResults
-from hrlspec.run.tables import aggregate_table, final_tables, ltl_table, suite_table
+from hrlspec.run.tables import aggregate_table, cell, final_tables, ltl_table, suite_table
 
 NAN = float("nan")
 
@@ -60,9 +60,9 @@ def test_a_suite() -> None:
     found = lines(suite_table(result()))
     assert "Unseen tasks: dag (2 tasks, 1,000 episodes)" in found[0]
     (row,) = [line.split() for line in found if line.strip().startswith("all ")]
-    assert row == ["all", "0.983", "[.88,1.00]", "0.983", "[-.12,1.20]", "12.3", "[11.1,13.9]", "0.500"]
+    assert row == ["all", "0.983", "[.88,1.00]", "0.983", "[-.13,1.20]", "12.3", "[11.1,13.9]", "0.500"]
     (failed,) = [line.split() for line in found if line.strip().startswith("depth 4")]
-    assert failed[5:] == ["[-.12,1.20]", "-", "0.500"]
+    assert failed[5:] == ["[-.13,1.20]", "-", "0.500"]
     text = " ".join(" ".join(found).split())
     for remark in ("sampled actions", "shield on", "violated: 0.012", "3 cases", "over optimum: 1.23", "SPL 0.800"):
         assert remark in text
@@ -86,6 +86,19 @@ def test_names_are_shown_as_they_are() -> None:
     stream = io.StringIO()
     PlainConsole(file=stream, width=80).print(suite_table(dataclasses.replace(result(), suite="[bold red]x[/] :eye:")))
     assert "Unseen tasks: [bold red]x[/] :eye: (2 tasks" in stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("interval", "shown"),
+    [
+        (Interval(0.999, 0.9964, 0.9997), "0.999 [.99,1.00]"),
+        (Interval(0.29, 0.29, 0.29), "0.290 [.29,.29]"),  # 100 times that is 28.999999999999996
+        (Interval(-0.004, -0.011, -0.002), "-0.004 [-.02,.00]"),
+        (Interval(31.25, 31.21, 31.29), "31.2 [31.2,31.3]"),
+    ],
+)
+def test_bounds_are_rounded_outwards(interval: Interval, shown: str) -> None:
+    assert cell(interval) == shown
 
 
 def test_bounds_lose_their_leading_zero_alone() -> None:
