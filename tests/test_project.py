@@ -54,3 +54,4 @@ def test_the_citation_is_of_this_version() -> None:
     citation = (ROOT / "CITATION.cff").read_text()
     assert re.findall(r"^version: (.*)$", citation, re.MULTILINE) == [hrlspec.version.__version__]
     assert "](CITATION.cff)" in (ROOT / "README.md").read_text()
+    assert f"version = {{{hrlspec.version.__version__}}}" in (ROOT / "docs" / "index.md").read_text()
