@@ -1,4 +1,4 @@
-"""Run folders that nobody trained."""
+"""Run folders that nobody trained, and what is in folders."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hrlspec.run.folder import open_run
+from hrlspec.run.folder import open_run, read_metrics
 from hrlspec.run.run_flags import experiments_of, parse_run
 
 
@@ -32,3 +32,13 @@ def make_run(folder: Path, *flags: str, success: Sequence[float] = (), final: fl
             results = {"suite": scores, "contested_choice": None, "first_choice": first}
             run.write_summary({"env_steps": 1024, "final": results, "pictures": []})
     return path
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Everything below a folder by its path; of folders nothing."""
+    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"" for path in folder.rglob("*")}
+
+
+def rows(folder: Path) -> list[dict[str, Any]]:
+    """Those of a run's ``metrics.jsonl``, without what depends on the clock."""
+    return [{k: v for k, v in row.items() if k not in ("wall_s", "train/steps_per_s")} for row in read_metrics(folder)]

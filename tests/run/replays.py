@@ -41,3 +41,8 @@ def played(*, ltl: bool = False) -> tuple[Any, list[Played], dict[str, Any]]:
         )
         both.append(Played(name, "scripted", *jax.device_get(found)))
     return layouts, both, page_data(LETTER, FORMULA if ltl else TASK, tasks, layouts, both)
+
+
+def at(changes: list[list[Any]], step: int) -> list[Any]:
+    """What a list of changes says of a step."""
+    return [change for change in changes if change[0] <= step][-1][1:]

@@ -15,6 +15,7 @@ from hrlspec.run.commands import evaluate
 from hrlspec.run.errors import main_guard
 from hrlspec.run.folder import open_run
 from hrlspec.run.run_flags import experiments_of, parse_run
+from tests.run.made import contents
 
 ROOT = Path(__file__).parents[2]
 
@@ -142,10 +143,6 @@ def test_videos_need_their_library(
     assert main_guard(lambda: evaluate.main(["--run", "run", "--suite", "dag", "--draw", "way.mp4"])) == 2
     expected = 'error: videos (.mp4) need the extra "video": pip install "hrlspec[video]"\n'
     assert capsys.readouterr().err == expected
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"" for path in folder.rglob("*")}
 
 
 @pytest.mark.parametrize(("flags", "message"), BAD_FLAGS, ids=[" ".join(flags)[:60] for flags, _ in BAD_FLAGS])

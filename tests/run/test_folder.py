@@ -20,6 +20,7 @@ from tensorboardX.record_writer import RecordWriter
 from hrlspec.run.configuration import config_hash
 from hrlspec.run.errors import UserError
 from hrlspec.run.folder import open_run, read_metrics, read_record, read_summary
+from tests.run.made import contents
 
 ROOT = Path(__file__).parents[2]
 
@@ -49,10 +50,6 @@ def events(file: Path) -> list[event_pb2.Event]:
 
 def scalars(file: Path) -> list[tuple[int, float]]:
     return [(event.step, value.simple_value) for event in events(file) for value in event.summary.value]
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_a_new_run_records_what_it_is(tmp_path: Path) -> None:

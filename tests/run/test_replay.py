@@ -8,7 +8,6 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,12 +25,7 @@ from hrlspec.spec import TaskState
 from tests.agent_files.made import write_tiny
 from tests.bare import Bare
 from tests.run import tiny
-from tests.run.replays import EPISODES, LETTER, played, tasks_of
-
-
-def at(changes: list[list[Any]], step: int) -> list[Any]:
-    """What a list of changes says of a step."""
-    return [change for change in changes if change[0] <= step][-1][1:]
+from tests.run.replays import EPISODES, LETTER, at, played, tasks_of
 
 
 def test_the_data_say_what_was_recorded() -> None:

@@ -16,7 +16,7 @@ import pytest
 
 from hrlspec.run.replay.page import page
 from tests.run.browsing import DESKTOP, PHONE, in_the_way, launched, needs_chromium, says
-from tests.run.replays import played
+from tests.run.replays import at, played
 
 pytestmark = needs_chromium
 
@@ -61,10 +61,6 @@ def visit(browser: Any, tmp_path: Path) -> Iterator[Visit]:
     assert not opened.trouble
     assert all(url.startswith(("file:", "data:")) for url in opened.requests)
     opened.tab.close()
-
-
-def at(changes: list[list[Any]], step: int) -> list[Any]:
-    return [change for change in changes if change[0] <= step][-1][1:]
 
 
 def check(visit: Visit, episode: int, step: int) -> None:

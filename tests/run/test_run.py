@@ -35,6 +35,7 @@ from hrlspec.run.run_flags import experiments_of, parse_run
 from hrlspec.spec import RUNNING, SATISFIED
 from hrlspec.spec.dfa import from_json
 from tests.run import tiny
+from tests.run.made import rows
 
 ROOT = Path(__file__).parents[2]
 PATIENCE = 900  # seconds; a busy machine may need most of it to load the programs
@@ -61,10 +62,6 @@ def compiled_programs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None
 
 def call(*argv: str) -> int:
     return main_guard(lambda: run.main(argv))
-
-
-def rows(folder: Path) -> list[dict[str, Any]]:
-    return [{k: v for k, v in row.items() if k not in ("wall_s", "train/steps_per_s")} for row in read_metrics(folder)]
 
 
 def final_hash(folder: Path) -> str:

@@ -21,6 +21,7 @@ from hrlspec.run.errors import UserError, main_guard
 from hrlspec.run.experiment import Experiment, experiment_of
 from hrlspec.run.folder import open_run
 from hrlspec.run.run_flags import experiments_of, parse_run, schedules_moved
+from tests.run.made import contents
 
 ROOT = Path(__file__).parents[2]
 
@@ -132,10 +133,6 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "damaged").mkdir()
     (folder / "damaged" / "config.json").write_text("{")
     return folder
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"" for path in folder.rglob("*")}
 
 
 @pytest.mark.parametrize(("flags", "message"), BAD_FLAGS, ids=[flags for flags, _ in BAD_FLAGS])

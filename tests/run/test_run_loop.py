@@ -21,6 +21,7 @@ from hrlspec.run.errors import Interrupted
 from hrlspec.run.folder import RunFolder, open_run, read_metrics
 from hrlspec.run.loop import Loop, Together
 from hrlspec.run.track import PATIENCE, DivergedError, Job, Track, UnsavedError
+from tests.run.made import rows
 
 STEPS, ITERATIONS, EVERY = 8, 13, 20
 
@@ -74,10 +75,6 @@ def loop(folder: Path, job: Job, display: Any = None, *, resume: bool = False, s
 def train(folder: Path, job: Job, display: Any = None, *, resume: bool = False, seconds: float = 1e9) -> Any:
     with loop(folder, job, display, resume=resume, seconds=seconds) as it:
         return it.train(it.restore())
-
-
-def timeless(folder: Path) -> list[dict[str, Any]]:
-    return [{k: v for k, v in row.items() if k not in ("wall_s", "train/steps_per_s")} for row in read_metrics(folder)]
 
 
 def stop() -> None:
@@ -159,7 +156,7 @@ def test_a_stopped_run_goes_on_as_if_nothing_had_happened(
     state = train(tmp_path, toy(), again, resume=True)
     assert display.losses + again.losses == reference[2]
     assert state_hash(state) == reference[1]
-    assert timeless(tmp_path) == timeless(reference[0])
+    assert rows(tmp_path) == rows(reference[0])
 
 
 def test_before_the_first_iteration_is_compiled_there_is_nothing_to_wait_for(
@@ -192,7 +189,7 @@ def test_a_signal_during_an_evaluation_waits_for_its_row(
     assert checkpoint.steps(tmp_path / "checkpoints") == [40]
     state = train(tmp_path, toy(), resume=True)
     assert state_hash(state) == reference[1]
-    assert timeless(tmp_path) == timeless(reference[0])
+    assert rows(tmp_path) == rows(reference[0])
 
 
 def test_a_crash_between_row_and_checkpoint_loses_no_row_and_repeats_none(
@@ -214,7 +211,7 @@ def test_a_crash_between_row_and_checkpoint_loses_no_row_and_repeats_none(
         assert it.position.done * STEPS < last
         state = it.train(state)
     assert state_hash(state) == reference[1]
-    assert timeless(tmp_path) == timeless(reference[0])
+    assert rows(tmp_path) == rows(reference[0])
 
 
 def test_a_run_killed_before_its_first_checkpoint_begins_anew(
@@ -228,7 +225,7 @@ def test_a_run_killed_before_its_first_checkpoint_begins_anew(
     assert [row["env_steps"] for row in read_metrics(tmp_path)] == [24, 40]
     assert checkpoint.steps(tmp_path / "checkpoints") == []
     assert state_hash(train(tmp_path, toy(), resume=True)) == reference[1]
-    assert timeless(tmp_path) == timeless(reference[0])
+    assert rows(tmp_path) == rows(reference[0])
 
 
 def test_checkpoints_of_another_run_are_refused(tmp_path: Path) -> None:
@@ -271,7 +268,7 @@ def test_a_full_disk_ends_the_run_and_costs_no_more_than_the_last_steps(
     assert message.endswith("--resume goes on from there")
     monkeypatch.undo()
     assert state_hash(train(tmp_path, toy(), resume=True)) == reference[1]
-    assert timeless(tmp_path) == timeless(reference[0])
+    assert rows(tmp_path) == rows(reference[0])
 
 
 def skipping(first: int, last: int) -> Callable[[Any, int], Any]:
@@ -359,7 +356,7 @@ def assert_as_alone(folder: Path, each_alone: Path) -> None:
     """Rows, and the checkpoints that an ordinary run would have left."""
     for seed in SEEDS:
         here, there = folder / f"seed{seed}", each_alone / f"seed{seed}"
-        assert timeless(here) == timeless(there)
+        assert rows(here) == rows(there)
         states = [checkpoint.load(one / "checkpoints", seed_job(seed).init()) for one in (here, there)]
         assert state_hash(states[0].state) == state_hash(states[1].state)
         for some in states:
