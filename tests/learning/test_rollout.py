@@ -1,118 +1,45 @@
-"""A rollout, and the batches made of it, replayed step by step in plain Python."""
+"""A rollout, replayed step by step in plain Python."""
 
 from __future__ import annotations
 
 import dataclasses
-import functools
-from typing import Any, NamedTuple
+from typing import Any
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import envs_jax
-from hrlspec.agent.agent import Agent
-from hrlspec.agent.experience import HighBatch, LowBatch, Step
-from hrlspec.agent.interaction import assign, start
+from hrlspec.agent.experience import Step
 from hrlspec.agent.low_level import TaskBook
-from hrlspec.config import CurriculumConfig, RelabelConfig, evolve
-from hrlspec.learning.batch import high_batch, low_batch
-from hrlspec.learning.experience import gather
+from hrlspec.config import evolve
 from hrlspec.learning.reach import reach_batch
-from hrlspec.learning.rollout import Collector, Setting, collect, fill_pool
+from hrlspec.learning.rollout import Setting, collect, fill_pool
 from hrlspec.learning.train import Trainer
-from hrlspec.methods import LTL2ACTION, Ours
-from hrlspec.spec import TaskState, TaskTree
+from hrlspec.methods import LTL2ACTION
+from hrlspec.spec import TaskState
 from hrlspec.tasks.curriculum import draw_bank
-from hrlspec.tasks.rewards import Bonus, RewardMachine, reward_machine
+from hrlspec.tasks.rewards import reward_machine
 from tests.agent.test_agent import read_shield
-from tests.learning.test_targets import low_reference, plan_reference
-from tests.probes import (
-    Corridor,
-    on_device,
-    pairs,
-    quick_jit,
-    random_params,
-    read_monitor,
-    small_agent,
-    small_config,
-    small_planner,
+from tests.learning.rollouts import (
+    AGENT,
+    CONFIG,
+    ENV,
+    RULES,
+    E,
+    T,
+    flat,
+    log_probs,
+    params,
+    plan_all,
+    position,
+    rollouts,
+    tree_of_row,
+    ways,
 )
+from tests.probes import on_device, pairs, quick_jit, read_monitor, small_agent, small_config
 from tests.tasks.test_rewards import reference as read_rewards
-
-# Letters everywhere, two of them together, and a short horizon: many episodes that end in every way.
-ENV = Corridor(cells=("a", "", "bc", "", "d", "", ""), starts=(1, 3, 5), horizon=9)
-CONFIG = small_config(
-    num_steps=48,
-    curriculum=CurriculumConfig(levels=3, tasks_per_level=32, max_nodes=8, tree_share=0.5),
-    shield=evolve(small_config().shield, {"threshold": 0.6}),
-    relabel=RelabelConfig(share=1.0),
-)
-PLANNER = small_planner(network__advice=1.0, advised=3, learns_unfinished=True)
-AGENT = Agent(ENV, CONFIG, Ours(high=PLANNER))
-E, T = CONFIG.num_envs, CONFIG.num_steps
-RULES = [Bonus("a", "d", 5.0), Bonus("b", "d", 10.0, ("a",))]
-LEVEL = 2
-
-
-class Rollout(NamedTuple):
-    """One rollout; ``carried`` says which decisions were made at the end of the one before."""
-
-    trajectory: Step
-    low: LowBatch
-    plan: HighBatch
-    after: Collector
-
-
-@quick_jit
-def prepare(params: Any, bank: TaskTree, key: jax.Array) -> tuple[TaskBook, Collector]:
-    tasks = jax.tree.map(lambda x: x[:E], bank)
-    book = AGENT.low.prepare(params, jax.tree.map(lambda *x: jnp.concatenate(x), tasks, bank))
-    layouts = jax.vmap(ENV.sample_layout, (0, None))(jax.random.split(key, E), ENV.default_params)
-    worker = start(jax.random.split(key, E), ENV, machine(), book, layouts, jnp.arange(E))
-    worker = assign(AGENT, params, book, worker, jnp.zeros((E, 8)))
-    zeros = jnp.zeros(E, jnp.int32)
-    return book, Collector(worker=worker, level=zeros, started=zeros, since=zeros)
-
-
-def batches(agent: Agent, key: jax.Array, params: Any, book: TaskBook, steps: Step) -> tuple[LowBatch, HighBatch]:
-    """What an iteration learns from."""
-    relabel_key, pick_key = jax.random.split(key)
-    blocks = gather(relabel_key, agent, params, machine(), book, steps, jnp.zeros(1, jnp.uint32), jnp.arange(E))
-    experience = jax.tree.map(lambda x: x[0], blocks)
-    assert agent.high.ppo is not None
-    return low_batch(agent, params, experience), high_batch(pick_key, agent, experience, agent.high.ppo)
-
-
-@quick_jit
-@chex.assert_max_traces(n=1)
-def roll(params: Any, book: TaskBook, collector: Collector, key: jax.Array) -> Rollout:
-    keys = jax.random.split(key, 3)
-    envs = jnp.arange(E, dtype=jnp.int32)
-    pool = fill_pool(keys[0], AGENT, book, jnp.int32(LEVEL), envs, size=12)
-    after, trajectory = collect(keys[1], Setting(AGENT, params, machine(), book, pool, envs), collector, 0.0)
-    return Rollout(trajectory, *batches(AGENT, keys[2], params, book, trajectory), after)
-
-
-def machine() -> RewardMachine:
-    return reward_machine(ENV.propositions, subtask=0.5, bonuses=RULES)
-
-
-@functools.cache
-def params() -> Any:
-    return random_params(AGENT, 3)
-
-
-@functools.cache
-def rollouts() -> tuple[TaskBook, Rollout, Rollout]:
-    """Two in a row; the tests look at the second, which begins and ends in the middle of episodes."""
-    bank = draw_bank(np.random.default_rng(0), CONFIG.curriculum, 4, np.zeros(0, np.uint32))
-    book, collector = prepare(params(), bank, jax.random.key(0))
-    first = roll(params(), book, collector, jax.random.key(1))
-    second = roll(params(), book, first.after, jax.random.key(2))
-    return jax.tree.map(np.asarray, (book, first, second))
 
 
 @pytest.fixture
@@ -123,20 +50,6 @@ def book() -> TaskBook:
 @pytest.fixture
 def t() -> Step:
     return rollouts()[2].trajectory
-
-
-def ways(tree: TaskTree, node: int, lost: Any = None) -> int:
-    """How many paths to a leaf are open; those that begin with a lost edge are not."""
-    children = [i for i in np.flatnonzero(tree.parent == node) if tree.valid[i] and (lost is None or not lost[i])]
-    return sum(ways(tree, i) for i in children) or int(tree.accepting[node])
-
-
-def tree_of_row(book: TaskBook, row: int) -> TaskTree:
-    return jax.tree.map(lambda x: x[row], book.tree)
-
-
-def position(view: Any) -> np.ndarray:
-    return view[1].argmax(-1)
 
 
 def test_the_sample_is_rich(t: Step) -> None:
@@ -249,24 +162,9 @@ def test_what_lies_ahead_is_a_way_to_a_leaf(book: TaskBook, t: Step) -> None:
     assert plans > 0
 
 
-def flat(x: Any) -> Any:
-    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), x)
-
-
 @quick_jit
 def control(params: Any, view: Any, instruction: Any) -> Any:
     return jax.vmap(AGENT.low.control, (None, 0, 0))(params, view, instruction)
-
-
-@quick_jit
-def plan_all(params: Any, view: Any, tree: TaskTree, state: TaskState) -> Any:
-    instruction = jax.vmap(AGENT.low.instruct, (None, 0))(params, tree)
-    choice = AGENT.high.choose(AGENT.low, params, view, tree, state, instruction)
-    return choice.logits, choice.value
-
-
-def log_probs(logits: Any, choice: np.ndarray) -> np.ndarray:
-    return np.take_along_axis(np.asarray(jax.nn.log_softmax(logits)), choice[:, None], 1)[:, 0]
 
 
 def test_actions_values_and_the_shield(book: TaskBook, t: Step) -> None:
@@ -369,118 +267,6 @@ def test_cut_episodes_bootstrap_with_the_state_they_were_cut_in(book: TaskBook, 
     high = np.where(one_way, low, value[-1])
     np.testing.assert_allclose(t.bootstrap.high[-1][going_on], high[going_on], atol=1e-5)
     assert 0 < one_way[going_on].sum() < going_on.sum()
-
-
-# --- Batches ---
-
-
-def in_time(t: Step) -> dict[str, np.ndarray]:
-    ends = {name: getattr(t.outcome, name) for name in ("reward", "terminated", "truncated")}
-    return {**ends, "value": t.low.value, "decided": t.high.made, "high_value": t.high.value}
-
-
-def test_targets_of_the_originals_equal_the_reference(t: Step) -> None:
-    low = rollouts()[2].low
-    expected = low_reference({**in_time(t), "bootstrap": t.bootstrap.low}, 0.9, 0.95, True).T
-    credit = low.credit
-    valid = credit.valid[:E]
-    np.testing.assert_allclose(credit.target[:E][valid], expected[valid], rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(credit.advantage[:E], credit.target[:E] - t.low.value.T, atol=1e-5)
-    np.testing.assert_array_equal(valid, (t.episode < max(2, T // 5)).T)
-    np.testing.assert_array_equal(credit.learns[:E], valid & ~t.low.shielded.T)
-
-
-@quick_jit
-def low_log_probs(params: Any, low: LowBatch) -> jax.Array:
-    instruction = jax.vmap(jax.vmap(AGENT.low.instruct, (None, 0)), (None, 0))(params, low.trees)
-    row = jnp.arange(low.slot.shape[0])[:, None]
-    instruction = jax.tree.map(lambda x: x[row, low.slot, low.edge], instruction)
-    instruction = dataclasses.replace(instruction, ahead=low.ahead)
-    logits, _ = jax.vmap(jax.vmap(AGENT.low.respond, (None, 0, 0)), (None, 0, 0))(params, low.sight, instruction)
-    return jnp.take_along_axis(jax.nn.log_softmax(logits), low.decision.action[..., None], -1)[..., 0]
-
-
-def test_ratios_are_one_at_the_start_of_the_update() -> None:
-    """For what was not relabelled, at both levels."""
-    _, _, rollout = rollouts()
-    low, plan = rollout.low, rollout.plan
-    now = np.asarray(low_log_probs(params(), low))
-    learns = low.credit.learns & (np.arange(2 * E) < E)[:, None]
-    np.testing.assert_allclose(now[learns], low.decision.log_prob[learns], atol=1e-5)
-    assert learns.sum() > 30
-    logits, _ = plan_all(params(), plan.view, plan.tree, plan.state)
-    recomputed, chosen = log_probs(logits, plan.decision.edge), plan.credit.valid & (plan.decision.log_prob != 0)
-    np.testing.assert_allclose(recomputed[chosen], plan.decision.log_prob[chosen], atol=1e-5)
-    assert chosen.sum() > 10
-    assert (recomputed[chosen] < -0.1).sum() > 5
-
-
-def test_copies_keep_the_probability_that_their_actions_were_drawn_with(t: Step) -> None:
-    low, plan = rollouts()[2].low, rollouts()[2].plan
-    copied = [next(e for e in range(E) if (low.sight.shared[E + i] == low.sight.shared[e]).all()) for i in range(E)]
-    assert sorted(copied) == list(range(E))
-    np.testing.assert_array_equal(low.decision.log_prob[E:], t.low.log_prob.T[copied])
-    # The path of a copy is what happened: it was no choice. All other decisions are the rollout's.
-    drawn = plan.decision.log_prob[plan.credit.valid & (plan.decision.log_prob != 0)]
-    assert 0 < len(drawn) < plan.credit.valid.sum()
-    assert np.isin(drawn, t.high.log_prob).all()
-
-
-def test_planner_samples_are_decisions_with_their_targets(t: Step) -> None:
-    """Every sample of an original is one of the decisions of the reference, with its advantage."""
-    credit = rollouts()[2].plan.credit
-    known = plan_reference_of(t)
-    found = 0
-    for b in np.flatnonzero(credit.valid):
-        key = round(float(credit.advantage[b]), 3), round(float(credit.target[b]), 3)
-        found += any(abs(key[0] - a) < 2e-3 and abs(key[1] - g) < 2e-3 for a, g in known)
-    assert found >= 0.4 * credit.valid.sum()
-
-
-def plan_reference_of(t: Step) -> list[tuple[float, float]]:
-    x = {**in_time(t), "bootstrap": t.bootstrap.high}
-    advantages = plan_reference(x, 0.9, 0.95)
-    return [(a, a + float(t.high.value[where])) for where, a in advantages.items()]
-
-
-def test_transe_pairs_lead_from_a_decision_to_where_its_sub_task_was_completed() -> None:
-    plan = rollouts()[2].plan
-    pairs_ = np.flatnonzero(plan.credit.valid & plan.completed)
-    assert len(pairs_) > 10
-    here, there = position(plan.view), position(plan.next_view)
-    for b in pairs_:
-        assert plan.reached[b].any()
-        assert (ENV.table[there[b]] >= plan.reached[b]).all()
-        edges = [k for k in range(8) if plan.tree.parent[b, k] == plan.state.node[b] and plan.tree.valid[b, k]]
-        assert any((plan.tree.reach[b, k] == plan.reached[b]).all() for k in edges)
-        assert plan.decision.edge[b] in edges
-        assert abs(int(here[b]) - int(there[b])) <= ENV.horizon
-
-
-def test_without_unfinished_every_sample_was_completed() -> None:
-    """The paper's planner data: sub-tasks that were not completed are left out."""
-    _, _, rollout = rollouts()
-    t = rollout.trajectory
-    planner = dataclasses.replace(PLANNER, learns_unfinished=False)
-    agent = Agent(ENV, evolve(CONFIG, {"relabel.share": 0.0}), Ours(high=planner))
-    bank = rollouts()[0]
-
-    @quick_jit
-    def rebuild(book: TaskBook, t: Step) -> HighBatch:
-        return batches(agent, jax.random.key(0), params(), book, t)[1]
-
-    plan = jax.tree.map(np.asarray, rebuild(bank, t))
-    completed = 0
-    for e in range(E):
-        for s in np.flatnonzero(t.high.made[:, e] & (t.episode[:, e] < max(2, T // 5))):
-            end = s
-            o = t.outcome
-            ends = o.edge_taken | o.terminated | o.truncated
-            while end < T - 1 and not ends[end, e] and not t.high.made[end + 1, e]:
-                end += 1
-            completed += bool(o.edge_taken[end, e])
-    assert plan.credit.valid.sum() == min(completed, len(plan.credit.valid))
-    assert 0 < completed < t.high.made.sum()
 
 
 def test_noise_is_as_correlated_as_it_is_asked_to_be() -> None:
