@@ -183,6 +183,9 @@ class CurriculumConfig(Checked):
     contested: float = setting(0.0, least=0, most=1)
     """Share of episodes in layouts made to teach look-ahead, where nearest-first loses; in environments that are
     `envs_jax.ContestedLayouts`."""
+    retry: float = setting(0.0, least=0, most=1, later=True)
+    """Probability with which an episode that failed is begun again, the same task in the same layout. Rare ways to fail
+    are then practised about as many times more as there are tries, 1 / (1 - retry) at most."""
     joint: float = setting(0.0, least=0, most=1)
     """Share of sub-tasks that ask for propositions at once, in worlds where some can hold together."""
     max_branching: int = setting(3, least=1)

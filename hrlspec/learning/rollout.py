@@ -30,6 +30,8 @@ from hrlspec.tasks.rewards import RewardMachine
 
 JUDGED_AT_ONCE = 128
 """Decisions that the high level evaluates at a time when acting does not wait for them."""
+RETRIED = -1
+"""The level of an episode that was begun again: of none, for it says nothing about how hard a level's tasks are."""
 
 
 @struct.dataclass
@@ -46,9 +48,10 @@ class Collector:
     """What goes on from one rollout to the next; leading axis E."""
 
     worker: Worker
-    level: Int32[Array, " E"]  # curriculum level of each task
+    level: Int32[Array, " E"]  # curriculum level of each task, or `RETRIED`
     started: Int32[Array, " E"]  # episodes started so far, for the pool
     since: Int32[Array, " E"]  # steps since the sub-task in force was assigned
+    layout: Layout | None  # of the running episodes, where those that fail may be begun again
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +81,7 @@ class _Chance(NamedTuple):
     high: Float32[Array, "E N"]
     low: Float32[Array, "E ..."]
     keys: Key[Array, " E"]
+    retry: Float32[Array, " E"]
 
 
 def fill_pool(
@@ -191,11 +195,12 @@ def _draw(key: Key[Array, ""], setting: Setting, correlation: Float32[Array, ""]
     actions = setting.agent.low.actions
 
     def one(env: Int32[Array, ""]) -> _Chance:
-        keys = jax.random.split(jax.random.fold_in(key, env), 3)
+        keys = jax.random.split(jax.random.fold_in(key, env), 4)
         return _Chance(
             jax.random.gumbel(keys[0], (num_steps, num_nodes), jnp.float32),
             actions.noise_sequence(keys[1], num_steps, correlation),
             jax.random.split(keys[2], num_steps),
+            jax.random.uniform(keys[3], (num_steps,), jnp.float32),
         )
 
     chance: _Chance = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), jax.vmap(one)(setting.envs))
@@ -217,6 +222,10 @@ def _step(setting: Setting, carry: tuple[Collector, _Reach], chance: _Chance) ->
     ended = outcome.terminated | outcome.truncated
     started = collector.started + ended
     fresh = take(pool, jnp.arange(num_envs, dtype=jnp.int32), (started - 1) % pool.task.shape[1])
+    if collector.layout is not None:
+        retried = ~outcome.satisfied & (chance.retry < agent.config.curriculum.retry)
+        again = Pool(collector.layout, worker.task, jnp.full_like(fresh.level, RETRIED))
+        fresh = where(retried, again, fresh)
     after = if_any(lambda: start(reset_keys, agent.env, setting.machine, book, fresh.layout, fresh.task), ended, worker)
     reached = _reach_values(setting, worker.view)
     decision, bootstrap = _plan(setting, after, worker, outcome.truncated, chance.high)
@@ -238,6 +247,7 @@ def _step(setting: Setting, carry: tuple[Collector, _Reach], chance: _Chance) ->
         level=jnp.where(ended, fresh.level, collector.level),
         started=started,
         since=jnp.where(after.awaiting, 0, collector.since + 1),
+        layout=None if collector.layout is None else where(ended, fresh.layout, collector.layout),
     )
     if reached is not None:  # of the state that the next action is taken in: another one where an episode began
         values = functools.partial(jax.vmap(agent.low.reach_values, (None, 0)), setting.params)

@@ -26,7 +26,7 @@ from hrlspec.learning.experience import gather
 from hrlspec.learning.optimiser import Metrics, annealed, fit, optimiser
 from hrlspec.learning.ppo import low_level_loss
 from hrlspec.learning.reach import reach_batch, reach_loss
-from hrlspec.learning.rollout import Collector, Setting, collect, fill_pool
+from hrlspec.learning.rollout import RETRIED, Collector, Setting, collect, fill_pool
 from hrlspec.learning.shards import SPREAD, WHOLE, Shards
 from hrlspec.spec import TaskTree
 from hrlspec.tasks import curriculum
@@ -117,8 +117,9 @@ class Trainer:
             reserved: uint32, sorted hashes of held-out tasks, which relabelling must not produce.
 
         Returns:
-            The next state and float32 metrics: ``episodes`` and ``successes`` count what ended in the rollout,
-            ``returns`` is the sum of its rewards; ``violations`` and ``shielded`` per step, the level, and losses.
+            The next state and float32 metrics. Of the rollout's episodes, but for those that were begun again:
+            ``episodes`` and ``successes`` count what ended, ``steps`` is how many there were, ``returns`` the sum of
+            rewards. Of all: ``violations`` and ``shielded`` per step; the level, and losses.
         """
         self._check(bank)
         chex.assert_rank(reserved, 1)
@@ -188,7 +189,8 @@ class Trainer:
             awaiting=jnp.zeros(envs.shape, bool),
         )
         zeros = jnp.zeros(envs.shape, jnp.int32)
-        return Collector(worker=worker, level=zeros, started=zeros, since=zeros)
+        kept = layouts if agent.config.curriculum.retry else None
+        return Collector(worker=worker, level=zeros, started=zeros, since=zeros, layout=kept)
 
     def _optimisers(self) -> dict[str, Any]:
         """Optimiser settings of the parts that learn by gradient."""
@@ -267,12 +269,14 @@ def _places(state: TrainState) -> TrainState:
 
 
 def _summary(steps: Step, shards: Shards) -> Metrics:
-    """Finished episodes and the sum of rewards in a rollout, and rates per step."""
+    """Sums over a rollout, and rates per step."""
     outcome = steps.outcome
+    first = steps.level != RETRIED
     sums = {
-        "episodes": outcome.terminated | outcome.truncated,
-        "successes": outcome.satisfied,
-        "returns": outcome.reward,
+        "episodes": (outcome.terminated | outcome.truncated) & first,
+        "successes": outcome.satisfied & first,
+        "steps": first,
+        "returns": outcome.reward * first,
         "violations": outcome.terminated & ~outcome.satisfied,
         "shielded": steps.low.shielded,
     }

@@ -190,9 +190,9 @@ class Learner:
 
     def _summarise(self, sums: Mapping[str, float], iterations: int) -> dict[str, Any]:
         """Means over episodes of what the metrics add up over episodes, and over iterations of the others."""
-        rest = {name: value / iterations for name, value in sums.items() if name != "level"}
-        episodes, successes, returns = (rest.pop(name) for name in ("episodes", "successes", "returns"))
-        steps = self.experiment.config.steps_per_iteration
+        names = ("episodes", "successes", "returns", "steps")
+        episodes, successes, returns, steps = (sums[name] for name in names)
+        rest = {name: value / iterations for name, value in sums.items() if name not in (*names, "level")}
         return {
             "train/success_rate": successes / episodes if episodes else None,
             "train/return_mean": returns / episodes if episodes else None,

@@ -44,6 +44,7 @@ NEW = {
     "config.shield.optimiser.max_grad_norm": 1.0,
     "config.curriculum.joint": 0.0,
     "config.network.chart": [],
+    "config.curriculum.retry": 0.0,
     "begun_from": None,
 }
 """Settings with the value that the code had before."""

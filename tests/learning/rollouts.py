@@ -56,7 +56,7 @@ def prepare(params: Any, bank: TaskTree, key: jax.Array) -> tuple[TaskBook, Coll
     worker = start(jax.random.split(key, E), ENV, machine(), book, layouts, jnp.arange(E))
     worker = assign(AGENT, params, book, worker, jnp.zeros((E, 8)))
     zeros = jnp.zeros(E, jnp.int32)
-    return book, Collector(worker=worker, level=zeros, started=zeros, since=zeros)
+    return book, Collector(worker=worker, level=zeros, started=zeros, since=zeros, layout=None)
 
 
 def batches(agent: Agent, key: jax.Array, params: Any, book: TaskBook, steps: Step) -> tuple[LowBatch, HighBatch]:

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 import envs_jax
+from hrlspec.agent.agent import Agent
 from hrlspec.agent.experience import Step
 from hrlspec.agent.low_level import TaskBook
 from hrlspec.config import evolve
 from hrlspec.learning.reach import reach_batch
-from hrlspec.learning.rollout import Setting, collect, fill_pool
+from hrlspec.learning.rollout import RETRIED, Collector, Pool, Setting, collect, fill_pool
 from hrlspec.learning.train import Trainer
 from hrlspec.methods import LTL2ACTION
 from hrlspec.spec import TaskState
@@ -269,22 +270,54 @@ def test_cut_episodes_bootstrap_with_the_state_they_were_cut_in(book: TaskBook, 
     assert 0 < one_way[going_on].sum() < going_on.sum()
 
 
+def begun(agent: Agent, size: int) -> tuple[Setting, Collector]:
+    """An untrained agent with its first episodes, and a pool of ``size`` for each environment."""
+    rewards = reward_machine(agent.env.propositions)
+    bank = on_device(
+        draw_bank(np.random.default_rng(0), agent.config.curriculum, agent.env.num_propositions, np.zeros(0, np.uint32))
+    )
+    state = Trainer(agent).init(jax.random.key(0), bank, rewards)
+    book = agent.low.prepare(state.params, jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank))
+    envs = jnp.arange(agent.config.num_envs, dtype=jnp.int32)
+    pool = fill_pool(jax.random.key(1), agent, book, jnp.int32(0), envs, size=size)
+    return Setting(agent, state.params, rewards, book, pool, envs), state.collector
+
+
 def test_noise_is_as_correlated_as_it_is_asked_to_be() -> None:
     """An untrained policy of continuous actions is nothing but noise."""
-    env = envs_jax.make("walk")
-    agent = small_agent(env, evolve(small_config(num_steps=64), {"shield.enabled": False}), LTL2ACTION)
-    rewards = reward_machine(env.propositions)
-    bank = on_device(draw_bank(np.random.default_rng(0), agent.config.curriculum, 5, np.zeros(0, np.uint32)))
+    config = evolve(small_config(num_steps=64), {"shield.enabled": False})
+    agent = small_agent(envs_jax.make("walk"), config, LTL2ACTION)
 
     @quick_jit
     def actions(correlation: jax.Array) -> jax.Array:
-        state = Trainer(agent).init(jax.random.key(0), bank, rewards)
-        book = agent.low.prepare(state.params, jax.tree.map(lambda *x: jnp.concatenate(x), state.tasks, bank))
-        envs = jnp.arange(agent.config.num_envs, dtype=jnp.int32)
-        pool = fill_pool(jax.random.key(1), agent, book, jnp.int32(0), envs, size=2)
-        setting = Setting(agent, state.params, rewards, book, pool, envs)
-        return collect(jax.random.key(2), setting, state.collector, correlation)[1].low.action
+        return collect(jax.random.key(2), *begun(agent, 2), correlation)[1].low.action
 
     for correlation in (0.0, 0.9):
         drawn = np.asarray(actions(jnp.float32(correlation)))
         assert (drawn[1:] * drawn[:-1]).mean() / (drawn**2).mean() == pytest.approx(correlation, abs=0.08)
+
+
+def test_half_of_the_failed_episodes_are_begun_again() -> None:
+    """With the same task in the same place; all others are the pool's, in turn."""
+    config = evolve(small_config(num_steps=64), {"shield.enabled": False, "curriculum.retry": 0.5})
+    agent = small_agent(ENV, config, LTL2ACTION)
+
+    @quick_jit
+    def rolled() -> tuple[Step, Pool, Any]:
+        setting, collector = begun(agent, 3)
+        return collect(jax.random.key(2), setting, collector, 0.0)[1], setting.pool, collector.layout
+
+    t, pool, layout = jax.tree.map(np.asarray, rolled())
+    places, again, failed = position(t.view), 0, 0
+    for env in range(config.num_envs):
+        task, start = t.task[0, env], layout.start[env]
+        for number, end in enumerate(np.flatnonzero((t.outcome.terminated | t.outcome.truncated)[:-1, env])):
+            failed += not t.outcome.satisfied[end, env]
+            if t.level[end + 1, env] == RETRIED:
+                assert not t.outcome.satisfied[end, env]
+                again += 1
+            else:
+                task, start = pool.task[env, number % 3], pool.layout.start[env, number % 3]
+            assert (t.task[end + 1, env], places[end + 1, env]) == (task, start)
+    assert failed > 100
+    assert again / failed == pytest.approx(0.5, abs=0.15)
