@@ -15,6 +15,10 @@ import jax
 
 from hrlspec.version import __version__
 
+_CHANGES = (
+    *("status", "--porcelain", "--untracked-files=no"),
+    *("--", ":/", ":(top,exclude)results", ":(top,exclude)docs/results.md"),
+)
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "orbax-checkpoint")
 
 
@@ -38,7 +42,10 @@ def _program() -> str:
 
 
 def current_commit() -> str | None:
-    """The commit this code stands at, ``+changes`` if files differ from it; ``None`` where git does not know."""
+    """The commit this code stands at, ``+changes`` if files differ from it; ``None`` where git does not know.
+
+    Records in ``results`` and the page that is written of them are no code: commands add to them while they run.
+    """
     source = Path(__file__)
 
     def git(*arguments: str) -> str:
@@ -47,6 +54,6 @@ def current_commit() -> str | None:
 
     try:
         git("ls-files", "--error-unmatch", source.name)  # an installed copy may lie in somebody else's repository
-        return git("rev-parse", "HEAD") + ("+changes" if git("status", "--porcelain", "--untracked-files=no") else "")
+        return git("rev-parse", "HEAD") + ("+changes" if git(*_CHANGES) else "")
     except (OSError, subprocess.SubprocessError):
         return None
