@@ -82,6 +82,7 @@ BOUNDS: dict[type, dict[str, tuple[float, float]]] = {
         "tree_share": (0, 1),
         "joint": (0, 1),
         "contested": (0, 1),
+        "retry": (0, 1),
         "max_branching": (1, INF),
         "max_avoid": (0, INF),
         "tasks_per_level": (1, INF),
