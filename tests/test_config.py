@@ -53,6 +53,7 @@ BOUNDS: dict[type, dict[str, tuple[float, float]]] = {
         "critic": (1, INF),
         "reach_critic": (1, INF),
         "task_scale": (1e-3, 1e3),
+        "near": (0, 1e6),
         "lookahead": (0, INF),
         "memory": (0, INF),
     },

@@ -121,7 +121,10 @@ class LowLevel:
         future = self.controller.apply(params["low"], instructions.future[where], feasible, method="remaining")
         nothing = jnp.zeros((*edge.shape, instructions.reach.shape[-1]), jnp.float32)
         behind = jnp.zeros((*edge.shape, 0, instructions.reach.shape[-1]), jnp.float32)
-        return Instruction(reach=nothing, avoid=nothing, ahead=ahead, behind=behind, future=cast(Array, future))
+        forbidden = nothing[..., : instructions.forbidden.shape[-1]]
+        return Instruction(
+            reach=nothing, avoid=nothing, forbidden=forbidden, ahead=ahead, behind=behind, future=cast(Array, future)
+        )
 
     def instructions_of(
         self,

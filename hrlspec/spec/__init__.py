@@ -24,7 +24,7 @@ from hrlspec.spec.syntax import (
     Then,
 )
 from hrlspec.spec.text import to_text, tree_to_formula, tree_to_text
-from hrlspec.spec.tree import TaskTree, subtask_avoid
+from hrlspec.spec.tree import TaskTree, forbidden, subtask_avoid
 
 __all__ = [
     "RUNNING",
@@ -49,6 +49,7 @@ __all__ = [
     "bare_lines",
     "compile_task",
     "draw_task",
+    "forbidden",
     "initial",
     "open_edges",
     "parse",

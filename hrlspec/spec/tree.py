@@ -62,7 +62,20 @@ def subtask_avoid(tree: TaskTree) -> Bool[Array, "N P"]:
 
     For siblings that reach conjunctions this forbids more than eq. (2) does: ¬(b∧c) becomes ¬b and ¬c.
     """
-    siblings = (tree.parent[:, None] == tree.parent[None, :]) & tree.edges[:, None] & tree.edges[None, :]
-    siblings = siblings & ~np.eye(tree.num_nodes, dtype=bool)
-    reached_by_siblings = (siblings.astype(np.float32) @ tree.reach.astype(np.float32)) > 0
+    others = _siblings(tree) & ~np.eye(tree.num_nodes, dtype=bool)
+    reached_by_siblings = (others.astype(np.float32) @ tree.reach.astype(np.float32)) > 0
     return tree.avoid | (reached_by_siblings & ~tree.reach)
+
+
+def forbidden(tree: TaskTree) -> Bool[Array, "N P"]:
+    """What violates the task where each edge is open, bool ``[N, P]``: what the edge and all its siblings avoid.
+
+    Any other part of `subtask_avoid` ends the sub-task alone: the task goes on along another edge.
+    """
+    allowed_by_any = (_siblings(tree).astype(np.float32) @ (~tree.avoid).astype(np.float32)) > 0
+    return tree.avoid & ~allowed_by_any
+
+
+def _siblings(tree: TaskTree) -> Bool[Array, "N N"]:
+    """Which edges leave the same node; each is its own sibling."""
+    return (tree.parent[:, None] == tree.parent[None, :]) & tree.edges[:, None] & tree.edges[None, :]

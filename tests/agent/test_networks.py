@@ -297,7 +297,10 @@ def test_the_reach_critic_answers_in_the_unit_interval_for_each_goal() -> None:
 def instruction(rows: np.ndarray, network: NetworkConfig) -> Instruction:
     """To reach the first of the propositions (rows ``[R, P]``), avoid the second, and go on with the others."""
     future = np.zeros(network.task_features, np.float32)
-    return Instruction(reach=rows[0], avoid=rows[1], ahead=rows[2:], behind=rows[:0], future=future)
+    forbidden = rows[1] if network.forbidden else rows[1, :0]
+    return Instruction(
+        reach=rows[0], avoid=rows[1], forbidden=forbidden, ahead=rows[2:], behind=rows[:0], future=future
+    )
 
 
 @pytest.mark.parametrize("whole_task", [False, True])
@@ -358,6 +361,18 @@ def test_what_is_charted_of_a_proposition_is_seen_by_its_role() -> None:
         assert np.abs(np.asarray(unknown - before)).max() > 1e-3
 
 
+def test_what_is_near_is_seen_by_role_with_a_steeper_reading() -> None:
+    """Of the goal, of p₋ and of what is forbidden, after what is seen of all roles as it is."""
+    env = envs_jax.make("zone", physics="closed-form")
+    lidar, shared = np.random.default_rng(0).random((4, 16)).astype(np.float32), np.zeros(16, np.float32)
+    network = dataclasses.replace(small_config().network, roles=True, lookahead=2, forbidden=True, near=0.8)
+    agent = small_agent(env, small_config(network=network))
+    task = instruction(np.eye(4, dtype=np.float32), network).replace(forbidden=np.array([0, 0, 1, 1], np.float32))
+    steep = (lidar / 0.8) ** 8
+    roles = [*lidar, lidar[2] + lidar[3], steep[0], steep[1], steep[2] + steep[3]]
+    np.testing.assert_allclose(agent.low.see(View(lidar, shared), task).planes, np.stack(roles), rtol=1e-5)
+
+
 def test_the_low_level_turns_with_the_world() -> None:
     """Seen through any of the eight turns, it acts as before, turned, and values what it sees alike."""
     env = envs_jax.make("letter")
@@ -381,10 +396,11 @@ def test_the_low_level_turns_with_the_world() -> None:
     assert straight > 20  # the outputs do tell the actions apart
 
 
-def test_the_low_level_is_reflected_with_the_world() -> None:
+@pytest.mark.parametrize("more", [{}, {"forbidden": True, "near": 0.8}])
+def test_the_low_level_is_reflected_with_the_world(more: dict[str, Any]) -> None:
     """Seen in any of the four mirrors, its actions are reflected likewise, and it values what it sees alike."""
     env = envs_jax.make("zone", physics="closed-form")
-    network = dataclasses.replace(small_config().network, lookahead=2, symmetric=True)
+    network = dataclasses.replace(small_config().network, lookahead=2, symmetric=True, **more)
     agent, mirrors = small_agent(env, small_config(network=network)), env.symmetries
     params = random_params(agent, 3)
     colours = np.eye(4, dtype=np.float32)

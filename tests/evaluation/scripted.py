@@ -71,8 +71,9 @@ class Walking(LowLevel):
         child = tree.parent[None, :] == jnp.arange(tree.num_nodes)[:, None]
         following = jnp.where(child.any(-1)[:, None], tree.reach[child.argmax(-1)], False)
         reach, avoid, ahead = (x.astype(jnp.float32) for x in (tree.reach, subtask_avoid(tree), following[:, None]))
+        nothing = jnp.zeros((tree.num_nodes, 0))
         return Instruction(
-            reach=reach, avoid=avoid, ahead=ahead, behind=ahead[:, :0], future=jnp.zeros((tree.num_nodes, 0))
+            reach=reach, avoid=avoid, forbidden=nothing, ahead=ahead, behind=ahead[:, :0], future=nothing
         )
 
     def control(self, params: Params, view: View, instruction: Instruction) -> tuple[jax.Array, jax.Array]:

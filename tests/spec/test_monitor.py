@@ -34,6 +34,7 @@ from hrlspec.spec import (
     Then,
     advance,
     compile_task,
+    forbidden,
     initial,
     open_edges,
     parse,
@@ -301,3 +302,20 @@ def test_state_is_a_pytree_of_fixed_types() -> None:
     state = initial(tree)
     after = jax.jit(partial(advance, tree))(state, jnp.ones(len(NAMES), bool), 0)
     chex.assert_trees_all_equal_shapes_and_dtypes(state, after)
+
+
+def test_what_is_forbidden_violates_the_task_and_nothing_else_does(pairs: Pairs) -> None:
+    """Each proposition alone, at each node, while all edges are open."""
+
+    def violates(tree: TaskTree, edge: jax.Array, label: jax.Array) -> jax.Array:
+        start = initial(tree).replace(node=tree.parent[edge])
+        return advance(tree, start, label, edge).status == VIOLATED
+
+    over_labels = jax.vmap(violates, in_axes=(None, None, 0))
+    over_trees = jax.vmap(jax.vmap(over_labels, in_axes=(None, 0, None)), in_axes=(0, None, None))
+    trees = jax.tree.map(lambda x: x[:200], pairs.trees)
+    found = np.asarray(over_trees(trees, jnp.arange(MAX_NODES), jnp.eye(len(NAMES), dtype=bool)))
+    told, edges = np.asarray(jax.vmap(forbidden)(trees)), np.asarray(trees.edges)
+    np.testing.assert_array_equal(told[edges], found[edges])
+    assert not told[~edges].any()
+    assert told.sum() > 100 < (trees.avoid & ~told).sum()

@@ -21,7 +21,7 @@ from hrlspec.agent.networks.encoder import MLP, Encoder, Planes, Shared
 from hrlspec.agent.networks.symmetry import reflect, turn
 from hrlspec.agent.networks.tree import TaskEmbedding, lookahead, lookback
 from hrlspec.config import NetworkConfig
-from hrlspec.spec import TaskTree, subtask_avoid
+from hrlspec.spec import TaskTree, forbidden, subtask_avoid
 
 
 @struct.dataclass
@@ -31,6 +31,7 @@ class Instruction:
     Attributes:
         reach: float32 ``[P]``, p₊ of the assigned sub-task.
         avoid: float32 ``[P]``, p₋ (eq. 2).
+        forbidden: float32 ``[P]``, what violates the task; ``[0]`` where it has no role of its own.
         ahead: float32 ``[D, P]``, what may be reached 1, 2, ... sub-tasks after it.
         behind: float32 ``[C, P]``, what was reached 1, 2, ... sub-tasks before it.
         future: float32 ``[F]``, embedding of the task that remains after it, or of the whole remaining task where no
@@ -39,6 +40,7 @@ class Instruction:
 
     reach: Float32[Array, "*lead P"]
     avoid: Float32[Array, "*lead P"]
+    forbidden: Float32[Array, "*lead P_or_0"]
     ahead: Float32[Array, "*lead D P"]
     behind: Float32[Array, "*lead C P"]
     future: Float32[Array, "*lead F"]
@@ -96,6 +98,7 @@ class Controller(nn.Module):
         instruction = Instruction(
             reach=tree.reach.astype(jnp.float32),
             avoid=subtask_avoid(tree).astype(jnp.float32),
+            forbidden=forbidden(tree)[:, : None if self.config.forbidden else 0].astype(jnp.float32),
             ahead=lookahead(tree, depth).astype(jnp.float32),
             behind=lookback(tree, self.config.memory).astype(jnp.float32),
             future=embed(tree),
@@ -122,7 +125,11 @@ class Controller(nn.Module):
         planes, shared = view
         if not self.config.roles:
             return Sight(planes, shared, None)
-        planes, lookahead = self._by_role(planes, instruction), instruction.ahead.shape[0]
+        lookahead, close = instruction.ahead.shape[0], planes
+        planes = self._by_role(planes, instruction)
+        if self.config.near and close.ndim == 2:
+            now = dataclasses.replace(instruction, ahead=instruction.ahead[:0])
+            planes = jnp.concatenate([planes, self._by_role((close / self.config.near) ** 8, now)])
         if self.config.symmetric and isinstance(self.symmetries, Symmetries):
             planes, order = turn(planes, self.symmetries, lookahead)
             return Sight(planes, shared, order)
@@ -171,14 +178,15 @@ class Controller(nn.Module):
 
         By role the encoder need not push the whole observation through its latent to find the goal afterwards.
         """
-        roles = jnp.tensordot(
-            jnp.concatenate([instruction.reach[None], instruction.avoid[None], instruction.ahead]), planes, axes=1
-        )
+        alone = instruction.forbidden.reshape(-1, planes.shape[0])  # a row, or none
+        weights = jnp.concatenate([instruction.reach[None], instruction.avoid[None], instruction.ahead, alone])
+        roles = jnp.tensordot(weights, planes, axes=1)
         return jnp.concatenate([roles, planes]) if self.config.names else roles
 
     def _of_task(self, instruction: Instruction) -> tuple[Float32[Array, " _"], Float32[Array, " F"]]:
         """Features of the sub-task and of those before it, scaled, and the embedding of what remains."""
         future = self.task_embedding.of_sequence(instruction.ahead) if self.follows_plan else instruction.future
-        current = self.config.task_scale * jnp.concatenate([instruction.reach, instruction.avoid, *instruction.behind])
+        told = (instruction.reach, instruction.avoid, instruction.forbidden, *instruction.behind)
+        current = self.config.task_scale * jnp.concatenate(told)
         # An embedding of the same scale would outweigh the sub-task; without a sub-task it is the only conditioning.
         return current, future * (self.config.task_scale if self.sees == "whole task" else 1.0)
