@@ -371,6 +371,8 @@ def test_what_is_near_is_seen_by_role_with_a_steeper_reading() -> None:
     steep = (lidar / 0.8) ** 8
     roles = [*lidar, lidar[2] + lidar[3], steep[0], steep[1], steep[2] + steep[3]]
     np.testing.assert_allclose(agent.low.see(View(lidar, shared), task).planes, np.stack(roles), rtol=1e-5)
+    by_name = small_agent(env, small_config(network=dataclasses.replace(network, roles=False)))
+    np.testing.assert_allclose(by_name.low.see(View(lidar, shared), task).planes, [*lidar, *steep], rtol=1e-5)
 
 
 def test_the_low_level_turns_with_the_world() -> None:

@@ -123,13 +123,13 @@ class Controller(nn.Module):
             instruction: the assigned sub-task and what follows.
         """
         planes, shared = view
+        close = (planes / self.config.near) ** 8 if self.config.near and planes.ndim == 2 else None
         if not self.config.roles:
-            return Sight(planes, shared, None)
-        lookahead, close = instruction.ahead.shape[0], planes
-        planes = self._by_role(planes, instruction)
-        if self.config.near and close.ndim == 2:
+            return Sight(planes if close is None else jnp.concatenate([planes, close]), shared, None)
+        planes, lookahead = self._by_role(planes, instruction), instruction.ahead.shape[0]
+        if close is not None:
             now = dataclasses.replace(instruction, ahead=instruction.ahead[:0])
-            planes = jnp.concatenate([planes, self._by_role((close / self.config.near) ** 8, now)])
+            planes = jnp.concatenate([planes, self._by_role(close, now)])
         if self.config.symmetric and isinstance(self.symmetries, Symmetries):
             planes, order = turn(planes, self.symmetries, lookahead)
             return Sight(planes, shared, order)
