@@ -125,8 +125,8 @@ class NetworkConfig(Checked):
     """Whether what violates the task has a role of its own, beside p-, most of which ends no more than the sub-task."""
     near: float = setting(0.0, least=0, most=1e6, later=True)
     """Reading of a sensor at which something is near, such as at the edge of a zone. Vectors are then seen once more as
-    (reading / near)^8, by role those of the goal, p- and what is forbidden, which tells apart what is near: a lidar that
-    fades by exp(-d) also as one that fades by exp(-8 d). 0: not."""
+    (reading / near)^8, by role those of the goal, p- and what is forbidden, which tells apart what is near: a lidar
+    that fades by exp(-d) also as one that fades by exp(-8 d). 0: not."""
     lookahead: int = setting(2, least=0)
     """How many later sub-tasks have a role of their own."""
     memory: int = setting(0, least=0)
