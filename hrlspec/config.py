@@ -101,6 +101,8 @@ class NetworkConfig(Checked):
     without limit and costs an eighth."""
     actor: tuple[int, ...] = setting((64, 64, 64), least=1)
     critic: tuple[int, ...] = setting((64, 64), least=1)
+    critic_encoder: bool = setting(False, later=True)
+    """Whether the critic has an encoder, and a chart, of its own, which learn for the value alone."""
     reach_critic: tuple[int, ...] = setting((64, 64), least=1)
     """Hidden units of the critic behind the shield."""
     roles: bool = False

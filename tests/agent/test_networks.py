@@ -361,6 +361,21 @@ def test_what_is_charted_of_a_proposition_is_seen_by_its_role() -> None:
         assert np.abs(np.asarray(unknown - before)).max() > 1e-3
 
 
+def test_an_encoder_of_its_own_learns_for_the_value_alone() -> None:
+    """Nothing that the actor sees through learns for the critic, and nothing the other way round."""
+    network = dataclasses.replace(small_config().network, roles=True, chart=(8, 3), critic_encoder=True)
+    agent = small_agent(ENV, small_config(network=network))
+    params = random_params(agent, 3)
+    task = instruction(np.eye(ENV.num_propositions, dtype=np.float32)[: 2 + network.lookahead], network)
+
+    def learning(loss: Callable[[tuple[jax.Array, jax.Array]], jax.Array]) -> set[str]:
+        grads = jax.grad(lambda low: loss(agent.low.control({**params, "low": low}, VIEW, task)))(params["low"])
+        return {name for name, part in grads["params"].items() if any(np.any(x) for x in jax.tree.leaves(part))}
+
+    assert learning(lambda both: both[0].sum()) == {"encoder", "chart", "actor"}
+    assert learning(lambda both: both[1]) == {"critic_encoder", "critic_chart", "critic"}
+
+
 def test_what_is_near_is_seen_by_role_with_a_steeper_reading() -> None:
     """Of the goal, of p₋ and of what is forbidden, after what is seen of all roles as it is."""
     env = envs_jax.make("zone", physics="closed-form")

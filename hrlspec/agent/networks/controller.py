@@ -82,8 +82,11 @@ class Controller(nn.Module):
         """Declares the parts."""
         c = self.config
         self.task_embedding = TaskEmbedding(c.task_features, c.task_rounds, negatives=self.sees == "whole task")
+        charted = (*c.chart[:-1], self.num_propositions * c.chart[-1]) if c.chart else None
         self.encoder = Encoder(c.latent, c.conv_channels, c.encoder_mlp)
-        self.chart = MLP((*c.chart[:-1], self.num_propositions * c.chart[-1])) if c.chart else None
+        self.chart = MLP(charted) if charted else None
+        self.critic_encoder = Encoder(c.latent, c.conv_channels, c.encoder_mlp) if c.critic_encoder else None
+        self.critic_chart = MLP(charted) if charted and c.critic_encoder else None
         self.actor = MLP((*c.actor, self.num_outputs), final_scale=0.01)
         self.critic = MLP((*c.critic, 1), tanh=True, final_scale=1.0)
 
@@ -139,18 +142,15 @@ class Controller(nn.Module):
 
     def respond(self, sight: Sight, instruction: Instruction) -> tuple[Float32[Array, " outputs"], Float32[Array, ""]]:
         """The actor's outputs ``[num_outputs]`` and the value ``[]`` of what is seen, see `__call__`."""
-        shared = sight.shared
-        if self.chart is not None:
-            charted = self.chart(shared).reshape(self.num_propositions, -1)
-            shared = jnp.concatenate([shared, self._by_role(charted, instruction).reshape(-1)])
-        latent = nn.relu(self.encoder(sight.planes, shared))
-        x = jnp.concatenate([latent, *self._of_task(instruction)])
+        x = self._encoded(self.encoder, self.chart, sight, instruction)
         outputs, frame = self.actor(x), sight.frame
         if frame is not None and isinstance(self.symmetries, Symmetries):
             outputs = outputs[frame]
         elif frame is not None:
             # The outputs are means and deviations: a mean changes its sign with the action, its deviation does not.
             outputs = outputs * jnp.concatenate([frame, jnp.ones(self.num_outputs - len(frame), jnp.float32)])
+        if self.critic_encoder is not None:
+            x = self._encoded(self.critic_encoder, self.critic_chart, sight, instruction)
         return outputs, self.critic(x)[0]
 
     def __call__(
@@ -172,6 +172,16 @@ class Controller(nn.Module):
     ) -> tuple[Float32[Array, " outputs"], Float32[Array, ""]]:
         """Touches every parameter, for initialisation."""
         return self(view, jax.tree.map(lambda x: x[0], self.instruct(tree)))
+
+    def _encoded(
+        self, encoder: Encoder, chart: MLP | None, sight: Sight, instruction: Instruction
+    ) -> Float32[Array, " _"]:
+        """What actor or critic start from: the latent, the sub-task, and the embedding of what remains."""
+        shared = sight.shared
+        if chart is not None:
+            charted = chart(shared).reshape(self.num_propositions, -1)
+            shared = jnp.concatenate([shared, self._by_role(charted, instruction).reshape(-1)])
+        return jnp.concatenate([nn.relu(encoder(sight.planes, shared)), *self._of_task(instruction)])
 
     def _by_role(self, planes: Planes, instruction: Instruction) -> Float32[Array, "R ..."]:
         """What is seen of the goal, of what to avoid and of what lies ahead, ``[R, ...]``.
