@@ -45,6 +45,9 @@ NEW = {
     "config.curriculum.joint": 0.0,
     "config.network.chart": [],
     "config.curriculum.retry": 0.0,
+    "config.network.forbidden": False,
+    "config.network.near": 0.0,
+    "config.network.critic_encoder": False,
     "begun_from": None,
 }
 """Settings with the value that the code had before."""
@@ -84,9 +87,12 @@ BEFORE = {
     "config.low.value_coefficient": (0.5,),
     # LTL2Action had none under recipe hrlspec.
     "config.network.conv_channels": ([],),
+    # Zone under recipe hrlspec, which now is told what violates the task.
+    "config.network.forbidden": (False,),
+    "config.network.near": (0.0,),
     f"{_PLANNER}.steps_per_sample": (64,),
 }
-"""What has been changed for speed since the records were made, and what they say of it. The page of results tells."""
+"""What has been changed since the records were made, and what they say of it. The page of results tells."""
 
 
 def effective(settings: Mapping[str, Any]) -> dict[str, Any]:
