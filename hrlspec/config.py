@@ -124,7 +124,7 @@ class NetworkConfig(Checked):
     the last width says, which the low level sees by role beside what the world shows. For worlds that show the position
     alone: what is learned of a region in front of one goal is known of it in front of all others. Empty: no chart."""
     forbidden: bool = setting(False, later=True)
-    """Whether what violates the task has a role of its own, beside p-, most of which ends no more than the sub-task."""
+    """Whether what violates the task has a role of its own. It is a part of p-, whose rest ends the sub-task alone."""
     near: float = setting(0.0, least=0, most=1e6, later=True)
     """Reading of a sensor at which something is near, such as at the edge of a zone. Vectors are then seen once more as
     (reading / near)^8, by role those of the goal, p- and what is forbidden, which tells apart what is near: a lidar

@@ -70,6 +70,7 @@ class LTL2Action(Method):
             task_rounds=0,
             roles=False,
             names=False,
+            forbidden=False,
             memory=0,
             symmetric=False,
         )

@@ -46,7 +46,7 @@ def zone(settings: Settings, recipe: Recipe) -> Settings:
         return _of_paper(settings)
     return settings.evolve(
         {
-            # Of tasks with one way on, 4 % ended in a forbidden zone, at full speed and unforeseen by the critic.
+            # Of sub-tasks beside something forbidden 4 % ended in it, at full speed and unforeseen by the critic.
             "config.network.forbidden": True,
             # What the lidar reads at a zone's edge.
             "config.network.near": 0.82,

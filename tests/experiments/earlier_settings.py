@@ -92,7 +92,7 @@ BEFORE = {
     "config.network.near": (0.0,),
     f"{_PLANNER}.steps_per_sample": (64,),
 }
-"""What has been changed since the records were made, and what they say of it. The page of results tells."""
+"""What has been changed since the records were made, and what they say of it. ``results/README.md`` tells."""
 
 
 def effective(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -184,7 +184,7 @@ class Controller(nn.Module):
         return jnp.concatenate([nn.relu(encoder(sight.planes, shared)), *self._of_task(instruction)])
 
     def _by_role(self, planes: Planes, instruction: Instruction) -> Float32[Array, "R ..."]:
-        """What is seen of the goal, of what to avoid and of what lies ahead, ``[R, ...]``.
+        """What is seen of the goal, of what to avoid, of what lies ahead and of what is forbidden, ``[R, ...]``.
 
         By role the encoder need not push the whole observation through its latent to find the goal afterwards.
         """
