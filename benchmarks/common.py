@@ -119,23 +119,31 @@ def environment(
     return rate(roll, (jax.random.key(1), state, observation), num_envs * num_steps, seconds)
 
 
-def trainer_of(name: str, recipe: Recipe, devices: int) -> Trainer:
+def trainer_of(name: str, recipe: Recipe, devices: int, num_envs: int | None = None) -> Trainer:
     """The paper's method with a recipe's settings, on so many devices in as many blocks.
 
+    Args:
+        name: of the preset.
+        recipe: whose settings.
+        devices: as many as blocks.
+        num_envs: side by side; the preset's if not given.
+
     Raises:
-        UserError: the devices do not share the environments evenly, or there are not as many.
+        UserError: the devices or minibatches do not share the environments evenly, or there are not as many devices.
     """
     some = preset(name)
     config, method = some.settings("ours", recipe)
+    changes = {"blocks": devices} | ({} if num_envs is None else {"num_envs": num_envs})
     try:
-        return Trainer(Agent(some.make(), evolve(config, {"blocks": devices}), method), devices)
+        return Trainer(Agent(some.make(), evolve(config, changes), method), devices)
     except ConfigError as error:
-        raise UserError(f"--devices {devices}: {error}") from error
+        asked = f"--devices {devices}" + ("" if num_envs is None else f", {num_envs} environments")
+        raise UserError(f"{asked}: {error}") from error
 
 
-def learner(name: str, recipe: Recipe, devices: int) -> tuple[Trainer, Any, Any]:
-    """The paper's method, a bank of training tasks, and the rewards of set 1."""
-    trainer = trainer_of(name, recipe, devices)
+def learner(name: str, recipe: Recipe, devices: int, num_envs: int | None = None) -> tuple[Trainer, Any, Any]:
+    """The paper's method, a bank of training tasks, and the rewards of set 1; arguments as of `trainer_of`."""
+    trainer = trainer_of(name, recipe, devices, num_envs)
     nothing = np.zeros(0, np.uint32)
     banks = TaskBanks(0, trainer.agent.config.curriculum, trainer.agent.env.num_propositions, nothing)
     return trainer, banks.at(0), preset(name).rewards()

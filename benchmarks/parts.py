@@ -1,6 +1,6 @@
 """Where an iteration's time goes, on one device: collection and what it consists of, relabelling, learning; JSON.
 
-python -m benchmarks.parts [--envs letter walk zone] [--recipes paper hrlspec] [--seconds 5] [--out FILE]
+python -m benchmarks.parts [--envs letter walk zone] [--recipes paper hrlspec] [--num-envs 2048] [--out FILE]
 
 Each part is a program of its own, given what it is given in an iteration of a partly trained agent; that the sum
 differs from a whole iteration is what XLA makes of the parts together.
@@ -42,6 +42,8 @@ class Flags:
 
     envs: tuple[str, ...] = ("letter", "walk", "zone")
     recipes: tuple[Recipe, ...] = ("paper", "hrlspec")
+    num_envs: int | None = None
+    """Environments side by side; the preset's if not given."""
     iterations: int = 60
     """Of training before the parts are timed."""
     seconds: float = 5.0
@@ -50,9 +52,9 @@ class Flags:
     """Where the JSON goes besides standard output."""
 
 
-def parts(name: str, recipe: Recipe, iterations: int, seconds: float) -> dict[str, float]:
+def parts(name: str, recipe: Recipe, iterations: int, seconds: float, num_envs: int | None) -> dict[str, float]:
     """Milliseconds of an iteration by part, medians; of one step of collection, where the name says so."""
-    trainer, bank, machine = learner(name, recipe, devices=1)
+    trainer, bank, machine = learner(name, recipe, 1, num_envs)
     agent, config, ppo = trainer.agent, trainer.agent.config, trainer.agent.high.ppo
     options = compiler_options(preset(name).effort(recipe))
     reserved, key = jnp.zeros(1, jnp.uint32), jax.random.key(1)
@@ -159,11 +161,12 @@ def main() -> None:
     flags = tyro.cli(Flags, description=__doc__)
     prepare()
     report = {
-        f"{name}, {recipe}": parts(name, recipe, flags.iterations, flags.seconds)
+        f"{name}, {recipe}": parts(name, recipe, flags.iterations, flags.seconds, flags.num_envs)
         for name in flags.envs
         for recipe in flags.recipes
     }
-    text = json.dumps({"jax": jax.__version__, "milliseconds": report}, indent=2)
+    device = jax.devices()[0].device_kind
+    text = json.dumps({"jax": jax.__version__, "device": device, "milliseconds": report}, indent=2)
     print(text)
     if flags.out:
         flags.out.write_text(text + "\n")
