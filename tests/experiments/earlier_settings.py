@@ -87,9 +87,10 @@ BEFORE = {
     "config.low.value_coefficient": (0.5,),
     # LTL2Action had none under recipe hrlspec.
     "config.network.conv_channels": ([],),
-    # Zone under recipe hrlspec, which now is told what violates the task.
+    # Zone under recipe hrlspec, which now is told what violates the task, and whose critic has an encoder of its own.
     "config.network.forbidden": (False,),
     "config.network.near": (0.0,),
+    "config.network.critic_encoder": (False,),
     f"{_PLANNER}.steps_per_sample": (64,),
 }
 """What has been changed since the records were made, and what they say of it. ``results/README.md`` tells."""
