@@ -56,13 +56,13 @@ COMPARISONS = {
         ),
         Comparison(
             "zone-jaxolotl",
-            10_000_000,
+            5_000_000,
             ("jaxolotl/zone_finite", "jaxolotl/zone_infinite"),
             _BUDGET.format("20 million"),
         ),
         Comparison(
             "zone-nm-jaxolotl",
-            10_000_000,
+            5_000_000,
             ("jaxolotl/zone_nm_finite", "jaxolotl/zone_nm_infinite"),
             _BUDGET.format("20 million"),
         ),
