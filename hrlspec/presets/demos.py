@@ -24,7 +24,18 @@ def _rooms(settings: Settings, recipe: Recipe) -> Settings:
 
 
 def _dilemma(settings: Settings, recipe: Recipe) -> Settings:
-    return _small(walk(settings, recipe)).evolve({"config.curriculum.levels": 3, "config.network.symmetric": False})
+    settings = _small(walk(settings, recipe))
+    settings = settings.evolve({"config.curriculum.levels": 3, "config.network.symmetric": False})
+    if recipe != "hrlspec":
+        return settings
+    return settings.evolve(
+        {
+            # a lies in front of b, and is walked into by agents that mean to go to b: around it leads a way that has to
+            # be learned from the position alone, and that noise must not find for the policy.
+            "config.network.chart": (64, 64, 16),
+            "config.final_noise_correlation": 0.0,
+        }
+    )
 
 
 def _small(settings: Settings) -> Settings:

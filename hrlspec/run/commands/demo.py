@@ -59,7 +59,7 @@ class DemoFlags(Checked):
     methods: tuple[str, ...] = ()
     """Some of those that are compared, such as ours; all if not given."""
     steps: int | None = setting(None, least=1, most=2**40)
-    """Environment steps of each method; 0.6 M in rooms and 1 M in dilemma if not given."""
+    """Environment steps of each method; 0.6 M in rooms and 2 M in dilemma if not given."""
     out: Path = Path("runs")
     """Folder for the picture, and for a record of each method and seed: demo-rooms.jsonl."""
 
@@ -260,7 +260,7 @@ DEMOS = {
         2,
         "achieve a ensuring not d or achieve b ensuring not d; (achieve c ensuring not d)",
         ("ours", "option", "ltl2action"),
-        1_000_000,
+        2_000_000,
         height=6.4,
         bonuses=(Bonus("b", "c", 9.0),),
     ),
