@@ -70,7 +70,7 @@ def test_an_agent_that_was_not_trained_is_found_out() -> None:
 
 @pytest.mark.parametrize("name", packaged_agents())
 def test_training_can_begin_with_an_agent(name: str) -> None:
-    flags = parse_run(["--env", name, "--from", name])
+    flags = parse_run([*AGENTS[name], "--from", name])
     ((experiment, _),) = experiments_of(flags)
     file = check_beginning(flags, experiment)
     assert file is not None
