@@ -13,6 +13,7 @@ import dataclasses
 import functools
 import json
 import math
+import operator
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,7 +30,6 @@ from envs_jax.arrays import Array
 from envs_jax.base import Layout
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.experience import View, view_of
-from hrlspec.agent.groups import take
 from hrlspec.config import evolve
 from hrlspec.evaluation import Suite
 from hrlspec.evaluation.first_choice import first_choice_evaluation
@@ -57,7 +57,7 @@ class Flags:
     tasks: int = 400
     """Of a draw."""
     layouts: int = 25
-    """For each task."""
+    """For each task; one is enough where all are alike, as in Walk."""
     minibatch: int = 256
     learning_rate: float = 1e-3
     """At first; it falls to zero by a cosine."""
@@ -66,11 +66,11 @@ class Flags:
 
 
 class Samples(NamedTuple):
-    """First choices with their labels; leading axis B."""
+    """First choices with their labels; leading axis B, numpy leaves where they are drawn."""
 
     view: View
     tree: TaskTree
-    best: Bool[Array, "B N"]
+    best: Bool[Array | np.ndarray, "B N"]
 
 
 def draw(world: Preset, flags: Flags, number: int) -> tuple[Samples, int]:
@@ -97,9 +97,13 @@ def draw(world: Preset, flags: Flags, number: int) -> tuple[Samples, int]:
     suite = Suite("drawn", ("",) * flags.tasks, trees)
     machine, seed = world.rewards(flags.reward_set), int(rng.integers(2**31))
     cases = first_choice_evaluation(env, suite, machine, layouts_per_task=flags.layouts, seed=seed).cases
-    tree: TaskTree = jax.tree.map(lambda x: jnp.asarray(x[cases.task]), trees)
-    view = _first_views(env, jax.random.key(seed), jax.tree.map(jnp.asarray, cases.layouts))
-    return Samples(view, tree, jnp.asarray(cases.best)), flags.tasks * flags.layouts
+    pairs = flags.tasks * flags.layouts
+    # As many layouts in every draw, or each would compile anew.
+    layouts = jax.tree.map(lambda x: np.resize(x, (pairs, *x.shape[1:])), cases.layouts)
+    views = jax.device_get(_first_views(env, jax.random.key(seed), layouts))
+    view: View = jax.tree.map(lambda x: x[: len(cases)], views)
+    tree: TaskTree = jax.tree.map(lambda x: x[cases.task], trees)
+    return Samples(view, tree, cases.best), pairs
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -136,19 +140,19 @@ def train(flags: Flags) -> Iterator[dict[str, Any]]:
     state = transform.init(params["high"])
 
     @jax.jit
-    def descend(own: Any, state: Any, samples: Samples, rows: Array) -> tuple[Any, Any, Float32[Array, ""]]:
-        value, gradient = jax.value_and_grad(functools.partial(loss, agent))(own, take(samples, rows))
+    def descend(own: Any, state: Any, batch: Samples) -> tuple[Any, Any, Float32[Array, ""]]:
+        value, gradient = jax.value_and_grad(functools.partial(loss, agent))(own, batch)
         updates, state = transform.update(gradient, state, own)
         return optax.apply_updates(own, updates), state, value
 
     seen, drawn = 0, 0
     for number in range(flags.draws):
         samples, pairs = draw(world, flags, number)
-        order = np.random.default_rng([flags.seed, number, 1]).permutation(len(samples.best)).astype(np.int32)
+        order = np.random.default_rng([flags.seed, number, 1]).permutation(len(samples.best))
         losses = []
         for first in range(0, len(order) - flags.minibatch + 1, flags.minibatch):
-            rows = jnp.asarray(order[first : first + flags.minibatch])
-            params["high"], state, value = descend(params["high"], state, samples, rows)
+            batch = jax.tree.map(operator.itemgetter(order[first : first + flags.minibatch]), samples)
+            params["high"], state, value = descend(params["high"], state, batch)
             losses.append(value)
         seen, drawn = seen + len(losses) * flags.minibatch, drawn + pairs
         result = evaluate(jax.random.fold_in(key, number), agent, params, machine)
