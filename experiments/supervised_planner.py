@@ -70,7 +70,7 @@ class Samples(NamedTuple):
 
     view: View
     tree: TaskTree
-    best: Bool[Array | np.ndarray, "B N"]
+    best: Bool[Array, "B N"]
 
 
 def draw(world: Preset, flags: Flags, number: int) -> tuple[Samples, int]:
@@ -103,7 +103,7 @@ def draw(world: Preset, flags: Flags, number: int) -> tuple[Samples, int]:
     views = jax.device_get(_first_views(env, jax.random.key(seed), layouts))
     view: View = jax.tree.map(lambda x: x[: len(cases)], views)
     tree: TaskTree = jax.tree.map(lambda x: x[cases.task], trees)
-    return Samples(view, tree, cases.best), pairs
+    return Samples(view, tree, cast(Array, cases.best)), pairs
 
 
 @functools.partial(jax.jit, static_argnums=0)
