@@ -93,7 +93,9 @@ def main() -> None:
                 trainer_of(name, recipe, 1, number)
     asked = {name: value for name, value in dataclasses.asdict(flags).items() if name != "out"}
     device = {"device": jax.devices()[0].device_kind}
-    text = json.dumps({**asked, **device, "measured": measure(flags), **circumstances()}, indent=2)
+    # The flags are told above, and the rest of the command is where this machine keeps its files.
+    found = {name: value for name, value in circumstances().items() if name != "command"}
+    text = json.dumps({**asked, **device, "measured": measure(flags), **found}, indent=2)
     print(text)
     if flags.out:
         flags.out.write_text(text + "\n")
