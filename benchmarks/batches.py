@@ -9,7 +9,6 @@ large. What an agent learns from so many environments is another question.
 from __future__ import annotations
 
 import dataclasses
-import json
 import sys
 import time
 from pathlib import Path
@@ -19,9 +18,8 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from benchmarks.common import environment, learner, programs, rate, trainer_of
+from benchmarks.common import environment, learner, programs, rate, trainer_of, write_report
 from hrlspec.presets import Recipe
-from hrlspec.run.circumstances import circumstances
 from hrlspec.run.errors import main_guard
 from hrlspec.run.platform import prepare
 
@@ -91,14 +89,8 @@ def main() -> None:
         for recipe in flags.recipes:
             for number in flags.num_envs:
                 trainer_of(name, recipe, 1, number)
-    asked = {name: value for name, value in dataclasses.asdict(flags).items() if name != "out"}
-    device = {"device": jax.devices()[0].device_kind}
-    # The flags are told above, and the rest of the command is where this machine keeps its files.
-    found = {name: value for name, value in circumstances().items() if name != "command"}
-    text = json.dumps({**asked, **device, "measured": measure(flags), **found}, indent=2)
-    print(text)
-    if flags.out:
-        flags.out.write_text(text + "\n")
+    device = jax.devices()[0].device_kind
+    write_report(flags, {"device": device, "measured": measure(flags)})
 
 
 if __name__ == "__main__":

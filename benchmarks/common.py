@@ -27,6 +27,7 @@ from hrlspec.config import ConfigError, evolve
 from hrlspec.learning.rollout import Setting, collect, fill_pool
 from hrlspec.learning.train import Trainer
 from hrlspec.presets import Recipe, preset
+from hrlspec.run.circumstances import circumstances
 from hrlspec.run.errors import UserError
 from hrlspec.run.platform import prepare
 from hrlspec.run.programs import Program
@@ -211,6 +212,17 @@ def compile_times(script: str, name: str, recipe: str, devices: int) -> dict[str
             run = subprocess.run(command, env=environ, check=True, capture_output=True, text=True)
             result[which] = {**json.loads(run.stdout), "process_s": time.perf_counter() - before}
     return result
+
+
+def write_report(flags: Any, measured: Mapping[str, Any]) -> None:
+    """Prints one JSON object, of the flags, what was measured and on what; and writes it to ``flags.out``, if any."""
+    asked = {name: value for name, value in dataclasses.asdict(flags).items() if name != "out"}
+    # The flags are told apart, and the rest of the command is where this machine keeps its files.
+    found = {name: value for name, value in circumstances().items() if name != "command"}
+    text = json.dumps({**asked, **measured, **found}, indent=2)
+    print(text)
+    if flags.out:
+        flags.out.write_text(text + "\n")
 
 
 def main(script: str, env: str, flags: CommonFlags, measure: Callable[[], Mapping[str, Any]]) -> None:

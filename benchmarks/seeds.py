@@ -10,7 +10,6 @@ on an iteration of a seed depends less on who else uses the machine.
 from __future__ import annotations
 
 import dataclasses
-import json
 import resource
 import sys
 import time
@@ -22,13 +21,12 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from benchmarks.common import spread
+from benchmarks.common import spread, write_report
 from hrlspec.agent.agent import Agent
 from hrlspec.learning.seeds import Seeds
 from hrlspec.learning.shards import most_devices
 from hrlspec.learning.train import Trainer, TrainState
 from hrlspec.presets import Recipe, preset
-from hrlspec.run.circumstances import circumstances
 from hrlspec.run.errors import main_guard
 from hrlspec.run.platform import prepare
 from hrlspec.run.programs import Program
@@ -154,18 +152,9 @@ def main() -> None:
     flags = tyro.cli(Flags, description=__doc__)
     prepare(host_devices=flags.devices)
     jax.config.update("jax_enable_compilation_cache", False)
-    asked = {name: value for name, value in dataclasses.asdict(flags).items() if name != "out"}
-    report = {
-        **asked,
-        "contestants": compare(flags),
-        "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
-    }
-    # The flags are told above, and the rest of the command is where this machine keeps its files.
-    found = {name: value for name, value in circumstances().items() if name != "command"}
-    text = json.dumps({**report, **found}, indent=2)
-    print(text)
-    if flags.out:
-        flags.out.write_text(text + "\n")
+    contestants = compare(flags)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+    write_report(flags, {"contestants": contestants, "peak_memory_mib": peak})
 
 
 if __name__ == "__main__":

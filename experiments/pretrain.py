@@ -28,15 +28,15 @@ from hrlspec.run.run_flags import experiments_of, parse_run
 from hrlspec.run.signals import leave
 
 AGENTS: dict[str, tuple[str, ...]] = {
-    name: ("--env", name, "--seed", "0", *flags)
-    for name, *flags in (
-        *(("letter",), ("letter12",), ("walk",), ("flatworld",), ("zone",), ("zone-nm",)),
-        *(("zone-jaxolotl",), ("zone-nm-jaxolotl",)),
-        # Two chains need no larger network, and whoever installs the package loads all agents.
-        ("conveyor-simple-8", "--config.network.encoder-mlp", "64"),
+    name: ("--env", name, "--seed", "0")
+    for name in (
+        *("letter", "letter12", "walk", "flatworld", "zone", "zone-nm"),
+        *("zone-jaxolotl", "zone-nm-jaxolotl", "conveyor-simple-8"),
     )
 }
 """The flags of the run that makes each, by its name."""
+# Two chains need no larger network, and whoever installs the package loads all agents.
+AGENTS["conveyor-simple-8"] += ("--config.network.encoder-mlp", "64")
 PAGE = Path("docs/pretrained.md")
 _MARK = "<!-- written by python -m experiments.pretrain -->\n"
 

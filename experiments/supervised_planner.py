@@ -36,6 +36,7 @@ from hrlspec.evaluation.first_choice import first_choice_evaluation
 from hrlspec.methods import ImplicitPlanner
 from hrlspec.presets import Preset, Recipe, RewardSet, preset
 from hrlspec.presets.suite_rules import MAX_NODES
+from hrlspec.run.circumstances import circumstances
 from hrlspec.run.errors import main_guard
 from hrlspec.run.platform import prepare
 from hrlspec.spec import TaskTree, initial
@@ -172,7 +173,9 @@ def main() -> None:
     columns = ("samples", "drawn", "loss", "first_choice", "first_choice_interval")
     settings = {**dataclasses.asdict(flags), "out": None}
     report = {"flags": settings, **shared, "curve": {name: [row[name] for row in curve] for name in columns}}
-    text = json.dumps(report, indent=2)
+    # The flags are told, and the rest of the command is where this machine keeps its files.
+    found = {name: value for name, value in circumstances().items() if name != "command"}
+    text = json.dumps({**report, **found}, indent=2)
     print(text)
     if flags.out is not None:
         flags.out.write_text(text + "\n")

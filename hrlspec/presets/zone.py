@@ -50,7 +50,7 @@ def zone(settings: Settings, recipe: Recipe) -> Settings:
             "config.network.forbidden": True,
             # What the lidar reads at a zone's edge.
             "config.network.near": 0.82,
-            # Sharing one with the policy the critic foresaw a tenth of what it could have.
+            # Sharing one with the policy the critic foresaw an eighth of what it could have.
             "config.network.critic_encoder": True,
         }
     )
