@@ -41,28 +41,29 @@ from hrlspec.run.figures import save
 from hrlspec.run.progress import duration
 
 _ABOUT = """\
-Written by `python -m experiments.reproduce` from the records in `results/paper`; each names the flags that made it.
-Returns are undiscounted means over 2,000 episodes of 200 unseen tasks (at the end) or 100 episodes of 10 (along the
-curves), actions sampled, no shield. Steps are those of successful episodes; "of optimum" is the share of the best way's
-return, where an exact planner knows it (suite `branches`); first choice is the share of first sub-tasks that are best
-ones, in tasks where that matters; contested is contested choice, 0.5 for an agent that always takes the nearest
-instance. The ratio is of the steps that ours takes to 90 % of its curve's last value to those of the method. Figures
-are interquartile means over seeds (training: means) with stratified bootstrap intervals (95 %); bands are Student's t
-intervals. All methods run through the same loop, with the same curriculum and, but for No-ER, relabelling. Recipe
-`paper` collects with the shield, also for Option; LTL2Action has no sub-task and so nothing to shield. Recipe `hrlspec`
-has no shield. The records are of [older code](#code) and of the first drawing of the suites, on whose tasks settings
-were chosen as well; tasks for validation and test have since been drawn anew, apart from each other. Training times, in
-minutes and seconds, are of runs side by side, one on each core, with compilation and evaluations; a few include a pause
-or other programs beside them."""
+Written by `python -m experiments.reproduce` from the records in `results/paper`, each of which names the flags that
+made it. Returns are undiscounted means over 2,000 episodes of 200 unseen tasks (at the end) or 100 episodes of 10
+(along the curves), with sampled actions and no shield. Steps are those of successful episodes. "Of optimum" is the
+share of the best way's return where an exact planner knows it (suite `branches`), "first choice" the share of first
+sub-tasks that are among the best in tasks where the choice matters, and "contested" is contested choice, 0.5 for an
+agent that always takes the nearest instance. The ratio divides the steps after which ours has reached 90 % of its
+curve's last value by the steps after which the method has reached 90 % of its own. Figures are interquartile means
+over seeds (training times: means) with stratified bootstrap intervals (95 %); bands are Student's t intervals. All
+methods run through the same loop, with the same curriculum and, except for No-ER, with relabelling. Recipe `paper`
+collects with the shield, for Option as well; LTL2Action has no sub-task and therefore nothing to shield. Recipe
+`hrlspec` has no shield. The records are of [older code](#code) and of the first draw of the suites, on whose tasks
+settings were also chosen; validation and test tasks have since been redrawn as separate suites. Training times, in
+minutes and seconds, are of runs side by side, one on each core, including compilation and evaluations; a few include
+a pause or other programs on the same machine."""
 _ABOUT_CLAIMS = """\
-Means over seeds are compared: of the curve's mean where the claim is about learning, of the final return where it is
-about the end. The difference has Welch's 95 % interval; the share is the probability that a run of the one beats a run
-of the other, with a bootstrap interval. p is that of the two-sided exact permutation test, corrected by Holm's method
-for all claims in all panels under all recipes, {family} tests, also those whose runs are not there yet. A claim holds,
-or does not, where the corrected p is below {level}. That takes {enough} runs on either side: with fewer, p is never
-small enough, however far apart the runs are. Recipe `planner` is compared with the baselines under recipe `paper`, of
-which it is a variant. Experiments that look for reasons where a claim does not hold, or is undecided, are in
-[decisions](decisions.md#where-claims-do-not-hold)."""
+Claims compare means over seeds: of the curve's mean where the claim is about learning, of the final return where it
+is about the end. The difference comes with Welch's 95 % interval; the share is the probability that a run of one
+method beats a run of the other, with a bootstrap interval. p is that of the two-sided exact permutation test,
+corrected by Holm's method over all claims in all panels under all recipes: {family} tests, including those whose runs
+are still missing. A claim is decided, one way or the other, where the corrected p is below {level}. That takes
+{enough} runs on either side: with fewer, p cannot become small enough, however far apart the runs are. Recipe
+`planner` is compared with the baselines under recipe `paper`, of which it is a variant. Experiments that look for the
+reasons why a claim does not hold or is undecided are listed in [decisions](decisions.md#where-claims-do-not-hold)."""
 
 
 def write_report(panels: Sequence[Panel], records: Mapping[Run, Record], figures: Path, report: Path) -> Iterator[Path]:

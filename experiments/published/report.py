@@ -27,25 +27,26 @@ FIRST_HAND = ("DeepLTL", "StructLTL")
 """Methods of the author of all files that numbers are from."""
 
 _ABOUT = f"""\
-Written by `python -m experiments.peers` from the records beside it, which name commits and settings. Ours is trained
-with the settings of recipe `hrlspec` on random tasks in SPECTRL, and acts on each formula's automaton as the package
-translates it. No formula was held out from training: one that SPECTRL can say as well, such as
-`!(red | yellow) U (blue & F green)`, may be among the random tasks. Settings were chosen on other tasks, but two of
-them because of what formulas below ask for: up to eight letters to avoid in letter12, and sub-tasks of several
+Written by `python -m experiments.peers` from the records beside it, which name commits and settings. Our agents are
+trained with the settings of recipe `hrlspec` on random SPECTRL tasks, and act on each formula's automaton as the
+package translates it. No formula was held out from training: one that SPECTRL can express as well, such as `!(red |
+yellow) U (blue & F green)`, may occur among the random tasks. Settings were chosen on other tasks, except for two
+that serve what the formulas below ask for: up to eight letters to avoid in letter12, and sub-tasks of several
 propositions at once in flatworld.
 
-Ours: {EPISODES} episodes of each formula and seed, each in a layout of its own, actions and sub-tasks sampled. Figures
-are means over seeds, those in brackets Student's t intervals (95 %), cut where no rate can be. An episode succeeds; or
-it violates the formula, after which nothing can satisfy it; or it leaves the arena; or it is in time for none of these.
-Steps are those of successful episodes. Rounds are accepting transitions within the horizon, one part after another in
-the order that [the page on tasks](../../docs/tasks.md) gives, so that other visits do not count; "none" is the share of
-episodes without a round. \\* some state has more paths to acceptance than the tree that the agent is shown; † some way
-on begins where nothing holds, which no sub-task asks for. A mean is over formulas, of steps over those with a success;
-where somebody has published some formulas alone, another row has the mean over these.
+Ours: {EPISODES} episodes for each formula and seed, each in its own layout, with sampled actions and sub-tasks.
+Figures are means over seeds; brackets hold Student's t intervals (95 %), cut at the bounds of a rate. An episode
+succeeds, or violates the formula (after which nothing can satisfy it), or leaves the arena, or runs out of time.
+Steps are those of successful episodes. Rounds are accepting transitions within the horizon, with the parts of a
+formula visited in the order that [the page on tasks](../../docs/tasks.md) gives, so that other visits do not count;
+"none" is the share of episodes without a round. \\* some state has more paths to acceptance than fit into the tree
+that the agent is shown; † some way on begins where nothing holds, which no sub-task asks for. A mean is over
+formulas, and for steps over those with a success; where others have published only some of the formulas, another row
+has the mean over these.
 
 Theirs: success / steps / violated, as far as they are known, or rounds, in the order that their translator chose. All
-numbers are from the peers' own files, which `experiments/published/published.csv` names row by row, and none was
-measured here; ‡ second-hand: not by the method's authors, but by those of another one."""
+of these numbers come from the peers' own files, which `experiments/published/published.csv` cites row by row; none
+was measured here. ‡ second-hand: published not by the method's authors but by those of another method."""
 
 
 class Published(NamedTuple):
