@@ -89,7 +89,7 @@ def test_learning_rates(name: str, recipe: Recipe, ours: float, ltl2action: floa
         ("letter12", "hrlspec", 6_000_000, 128, 64, 0.9, 0.97),
         ("walk", "paper", 2_000_000, 256, 128, 0.99, 0.99),
         ("walk", "hrlspec", 2_000_000, 256, 128, 0.99, 0.99),
-        ("flatworld", "hrlspec", 15_000_000, 256, 128, 0.99, 0.99),
+        ("flatworld", "hrlspec", 15_000_000, 256, 128, 0.997, 0.997),
         ("zone", "paper", 10_000_000, 256, 128, 0.998, 0.998),
         ("zone", "hrlspec", 10_000_000, 128, 128, 0.998, 0.998),
         ("zone-nm", "hrlspec", 10_000_000, 128, 128, 0.998, 0.998),
