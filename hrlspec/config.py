@@ -123,6 +123,9 @@ class NetworkConfig(Checked):
     """Layers of a chart: a network from the shared part of the observation to features of each proposition, as many as
     the last width says, which the low level sees by role beside what the world shows. For worlds that show the position
     alone: what is learned of a region in front of one goal is known of it in front of all others. Empty: no chart."""
+    waves: int = setting(0, least=0, most=16, later=True)
+    """Octaves of sines and cosines that the chart sees beside the shared part itself, the longest 4 of its units long
+    (Fourier features; Tancik et al., 2020). Without them it is slow to learn what differs over short distances."""
     forbidden: bool = setting(False, later=True)
     """Whether what violates the task has a role of its own. It is a part of p-, whose rest ends the sub-task alone."""
     near: float = setting(0.0, least=0, most=1e6, later=True)

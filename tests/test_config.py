@@ -54,6 +54,7 @@ BOUNDS: dict[type, dict[str, tuple[float, float]]] = {
         "reach_critic": (1, INF),
         "task_scale": (1e-3, 1e3),
         "near": (0, 1e6),
+        "waves": (0, 16),
         "lookahead": (0, INF),
         "memory": (0, INF),
     },

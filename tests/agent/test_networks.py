@@ -19,7 +19,7 @@ import envs_jax
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.distributions import MASKED
 from hrlspec.agent.experience import View
-from hrlspec.agent.networks.controller import Instruction
+from hrlspec.agent.networks.controller import Instruction, with_waves
 from hrlspec.agent.networks.encoder import convolve
 from hrlspec.agent.networks.planner import Planner
 from hrlspec.agent.networks.symmetry import TURNS, turned
@@ -333,9 +333,10 @@ def test_a_scaled_task_is_a_task_with_larger_weights(whole_task: bool) -> None:
         assert np.abs(np.asarray(a - old)).max() > 1e-3
 
 
-def test_what_is_charted_of_a_proposition_is_seen_by_its_role() -> None:
+@pytest.mark.parametrize("waves", [0, 2])
+def test_what_is_charted_of_a_proposition_is_seen_by_its_role(waves: int) -> None:
     """Propositions that change places in the chart, and in the weights that know them by name, do so in the task."""
-    network = dataclasses.replace(small_config().network, roles=True, chart=(8, 3), memory=0)
+    network = dataclasses.replace(small_config().network, roles=True, chart=(8, 3), waves=waves, memory=0)
     agent, order = small_agent(ENV, small_config(network=network)), np.array([2, 0, 3, 1])
     params = random_params(agent, 3)
 
@@ -360,6 +361,15 @@ def test_what_is_charted_of_a_proposition_is_seen_by_its_role() -> None:
     ):
         np.testing.assert_allclose(after, before, rtol=1e-5, atol=1e-6)
         assert np.abs(np.asarray(unknown - before)).max() > 1e-3
+
+
+def test_waves_are_sines_and_cosines_of_lengths_four_and_two() -> None:
+    np.testing.assert_allclose(with_waves(jnp.array([1.0]), 2), [1, 1, 0, 0, -1], atol=1e-6)
+    x = jnp.array([0.3, -1.2])
+    seen, a_length_on, half_a_length_on = (with_waves(x + shift, 2)[2:] for shift in (0.0, 4.0, 2.0))
+    np.testing.assert_allclose(a_length_on, seen, atol=1e-5)
+    np.testing.assert_allclose(half_a_length_on, seen * np.tile(np.repeat([-1, 1], 2), 2), atol=1e-5)
+    np.testing.assert_array_equal(with_waves(x, 0), x)
 
 
 def test_an_encoder_of_its_own_learns_for_the_value_alone() -> None:

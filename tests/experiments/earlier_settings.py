@@ -44,6 +44,7 @@ NEW = {
     "config.shield.optimiser.max_grad_norm": 1.0,
     "config.curriculum.joint": 0.0,
     "config.network.chart": [],
+    "config.network.waves": 0,
     "config.curriculum.retry": 0.0,
     "config.network.forbidden": False,
     "config.network.near": 0.0,

@@ -179,7 +179,7 @@ class Controller(nn.Module):
         """What actor or critic start from: the latent, the sub-task, and the embedding of what remains."""
         shared = sight.shared
         if chart is not None:
-            charted = chart(shared).reshape(self.num_propositions, -1)
+            charted = chart(with_waves(shared, self.config.waves)).reshape(self.num_propositions, -1)
             shared = jnp.concatenate([shared, self._by_role(charted, instruction).reshape(-1)])
         return jnp.concatenate([nn.relu(encoder(sight.planes, shared)), *self._of_task(instruction)])
 
@@ -200,3 +200,9 @@ class Controller(nn.Module):
         current = self.config.task_scale * jnp.concatenate(told)
         # An embedding of the same scale would outweigh the sub-task; without a sub-task it is the only conditioning.
         return current, future * (self.config.task_scale if self.sees == "whole task" else 1.0)
+
+
+def with_waves(x: Float32[Array, " F0"], octaves: int) -> Float32[Array, " _"]:
+    """Features with their sines and cosines at wavelengths 4, 2, 1, ...: ``[F0 (1 + 2 octaves)]``."""
+    angles = (x * (jnp.pi / 2) * 2.0 ** jnp.arange(octaves)[:, None]).reshape(-1)
+    return jnp.concatenate([x, jnp.sin(angles), jnp.cos(angles)])
