@@ -217,9 +217,7 @@ def compile_times(script: str, name: str, recipe: str, devices: int) -> dict[str
 def write_report(flags: Any, measured: Mapping[str, Any]) -> None:
     """Prints one JSON object, of the flags, what was measured and on what; and writes it to ``flags.out``, if any."""
     asked = {name: value for name, value in dataclasses.asdict(flags).items() if name != "out"}
-    # The flags are told apart, and the rest of the command is where this machine keeps its files.
-    found = {name: value for name, value in circumstances().items() if name != "command"}
-    text = json.dumps({**asked, **measured, **found}, indent=2)
+    text = json.dumps({**asked, **measured, **circumstances(command=False)}, indent=2)
     print(text)
     if flags.out:
         flags.out.write_text(text + "\n")

@@ -173,9 +173,7 @@ def main() -> None:
     columns = ("samples", "drawn", "loss", "first_choice", "first_choice_interval")
     settings = {**dataclasses.asdict(flags), "out": None}
     report = {"flags": settings, **shared, "curve": {name: [row[name] for row in curve] for name in columns}}
-    # The flags are told, and the rest of the command is where this machine keeps its files.
-    found = {name: value for name, value in circumstances().items() if name != "command"}
-    text = json.dumps({**report, **found}, indent=2)
+    text = json.dumps({**report, **circumstances(command=False)}, indent=2)
     print(text)
     if flags.out is not None:
         flags.out.write_text(text + "\n")

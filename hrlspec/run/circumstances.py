@@ -22,13 +22,17 @@ _CHANGES = (
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "orbax-checkpoint")
 
 
-def circumstances() -> dict[str, Any]:
-    """What numbers depend on beside the configuration: versions, commit, command, time, machine, devices."""
+def circumstances(*, command: bool = True) -> dict[str, Any]:
+    """What numbers depend on beside the configuration: versions, commit, command, time, machine, devices.
+
+    Args:
+        command: whether the command is among them; it tells where this machine keeps its files.
+    """
     versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
     return {
         "versions": {"hrlspec": __version__, "python": platform.python_version(), **versions},
         "commit": current_commit(),
-        "command": [_program(), *sys.argv[1:]],
+        **({"command": [_program(), *sys.argv[1:]]} if command else {}),
         "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPUs",
         "devices": [str(device) for device in jax.devices()],
