@@ -128,6 +128,9 @@ class NetworkConfig(Checked):
     (Fourier features; Tancik et al., 2020). Without them it is slow to learn what differs over short distances."""
     forbidden: bool = setting(False, later=True)
     """Whether what violates the task has a role of its own. It is a part of p-, whose rest ends the sub-task alone."""
+    exclusions: bool = setting(False, later=True)
+    """Whether the low level counts what is never entered after what, and adds to p-, and to what is forbidden, what
+    would so put its goal, or what is owed later, out of reach."""
     near: float = setting(0.0, least=0, most=1e6, later=True)
     """Reading of a sensor at which something is near, such as at the edge of a zone. Vectors are then seen once more as
     (reading / near)^8, by role those of the goal, p- and what is forbidden, which tells apart what is near: a lidar

@@ -18,9 +18,10 @@ from jaxtyping import Bool, Float32, Int, Int32
 from envs_jax import Environment, Symmetric
 from envs_jax.arrays import Array
 from hrlspec.agent.distributions import Distribution, distribution_over
-from hrlspec.agent.experience import View
+from hrlspec.agent.experience import Step, View
 from hrlspec.agent.groups import take
 from hrlspec.agent.networks.controller import Controller, Instruction, Sees, Sight
+from hrlspec.agent.networks.exclusions import Exclusions, entries
 from hrlspec.agent.networks.reach_critic import ReachCritic
 from hrlspec.agent.networks.tree import forks
 from hrlspec.config import Config
@@ -183,6 +184,17 @@ class LowLevel:
         rows = jnp.arange(edge.shape[0], dtype=jnp.int32)
         now = self.instructions_at(params, instructions, (rows,), edge, feasible, instructions.ahead[rows, edge])
         return jax.vmap(self.control, in_axes=(None, 0, 0))(params, view, now)[1]
+
+    def measure(self, steps: Step) -> Any:
+        """What is counted in a rollout ``[T, E]`` rather than learned by gradient: a pytree of sums for `observe`."""
+        return entries(steps.outcome.labels, steps.episode) if self.config.network.exclusions else ()
+
+    def observe(self, params: Any, measured: Any) -> Any:
+        """``params["low"]`` after a rollout, from the sums of `measure`."""
+        if not self.config.network.exclusions:
+            return params
+        name, new = Exclusions.COLLECTION, {"exclusions": {"entries": measured}}
+        return {**params, name: jax.tree.map(jnp.add, params[name], new)}
 
     def reach_values(self, params: Params, view: View) -> Float32[Array, "P K"]:
         """Q(s, g, a) of reaching each proposition by each candidate action, float32 ``[P, K]``.

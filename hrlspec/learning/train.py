@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import chex
@@ -20,7 +21,7 @@ from hrlspec.agent.agent import Agent
 from hrlspec.agent.experience import Experience, Step
 from hrlspec.agent.groups import take
 from hrlspec.agent.interaction import start
-from hrlspec.agent.low_level import Params, TaskBook
+from hrlspec.agent.low_level import Params
 from hrlspec.learning.batch import high_batch, low_batch
 from hrlspec.learning.experience import gather
 from hrlspec.learning.optimiser import Metrics, annealed, fit, optimiser
@@ -149,7 +150,9 @@ class Trainer:
         relabel_key, pick_key = jax.random.split(keys[2])
         experience = gather(relabel_key, agent, state.params, machine, book, steps, reserved, envs)
         params, optimisers, losses = self._learn(keys[3], pick_key, state, experience, steps, progress)
-        params["high"] = agent.high.observe(params["high"], self._measured(book, steps))
+        measured = self._measured(lambda block: agent.high.measure(book, block, config), steps)
+        params["high"] = agent.high.observe(params["high"], measured)
+        params["low"] = agent.low.observe(params["low"], self._measured(agent.low.measure, steps))
         new_state = TrainState(
             params=params,
             optimisers=optimisers,
@@ -247,13 +250,13 @@ class Trainer:
         episodes, successes = self.shards.total(self.shards.in_blocks(kinds.T).sum((1, 2), dtype=jnp.int32))
         return curriculum.update(before, episodes, successes, self.agent.config.curriculum)
 
-    def _measured(self, book: TaskBook, steps: Step) -> Any:
-        """The high level's measurements, added up over all environments."""
+    def _measured(self, measure: Callable[[Step], Any], steps: Step) -> Any:
+        """A level's measurements, added up over all environments."""
         blocks = jax.tree.map(lambda x: self.shards.in_blocks(jnp.swapaxes(x, 0, 1)), steps)
 
         def one(block: Step) -> Any:
             in_time = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), block)
-            return self.agent.high.measure(book, in_time, self.agent.config)
+            return measure(in_time)
 
         return jax.tree.map(self.shards.total, self.shards.each_block(one, blocks))
 

@@ -47,6 +47,7 @@ NEW = {
     "config.network.waves": 0,
     "config.curriculum.retry": 0.0,
     "config.network.forbidden": False,
+    "config.network.exclusions": False,
     "config.network.near": 0.0,
     "config.network.critic_encoder": False,
     "begun_from": None,

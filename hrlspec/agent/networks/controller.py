@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float32, Shaped
 from envs_jax import Reflections, Symmetries
 from envs_jax.arrays import Array
 from hrlspec.agent.networks.encoder import MLP, Encoder, Planes, Shared
+from hrlspec.agent.networks.exclusions import Exclusions
 from hrlspec.agent.networks.symmetry import reflect, turn
 from hrlspec.agent.networks.tree import TaskEmbedding, lookahead, lookback
 from hrlspec.config import NetworkConfig
@@ -83,6 +84,7 @@ class Controller(nn.Module):
         c = self.config
         self.task_embedding = TaskEmbedding(c.task_features, c.task_rounds, negatives=self.sees == "whole task")
         charted = (*c.chart[:-1], self.num_propositions * c.chart[-1]) if c.chart else None
+        self.exclusions = Exclusions(later=self.sees != "sub-task") if c.exclusions else None
         self.encoder = Encoder(c.latent, c.conv_channels, c.encoder_mlp)
         self.chart = MLP(charted) if charted else None
         self.critic_encoder = Encoder(c.latent, c.conv_channels, c.encoder_mlp) if c.critic_encoder else None
@@ -98,10 +100,14 @@ class Controller(nn.Module):
         """
         depth = self.config.lookahead if self.config.roles else 0
         embed = self.task_embedding.messages if self.sees == "whole task" else self.task_embedding
+        avoid, violates = subtask_avoid(tree), forbidden(tree)
+        if self.exclusions is not None:
+            spoils = self.exclusions(tree)
+            avoid, violates = avoid | spoils, violates | spoils
         instruction = Instruction(
             reach=tree.reach.astype(jnp.float32),
-            avoid=subtask_avoid(tree).astype(jnp.float32),
-            forbidden=forbidden(tree)[:, : None if self.config.forbidden else 0].astype(jnp.float32),
+            avoid=avoid.astype(jnp.float32),
+            forbidden=violates[:, : None if self.config.forbidden else 0].astype(jnp.float32),
             ahead=lookahead(tree, depth).astype(jnp.float32),
             behind=lookback(tree, self.config.memory).astype(jnp.float32),
             future=embed(tree),
