@@ -213,7 +213,12 @@ def random_params(agent: Agent, seed: int) -> Any:
     """Parameters of the right shapes, biases included, without compiling the initialisers."""
     rng = np.random.default_rng(seed)
     shapes = jax.eval_shape(agent.init, jax.random.key(0))
-    return jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape) / np.sqrt(max(*x.shape[:1], 4, 4)), x.dtype), shapes)
+
+    def draw(x: Any) -> jax.Array:
+        inputs = x.shape[0] if x.shape else 1
+        return jnp.asarray(rng.normal(size=x.shape) / np.sqrt(max(inputs, 4)), x.dtype)
+
+    return jax.tree.map(draw, shapes)
 
 
 def on_device(tree: Any) -> Any:
