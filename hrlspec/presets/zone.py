@@ -11,7 +11,7 @@ import numpy as np
 import envs_jax
 from envs_jax.zone import point_mass
 from envs_jax.zone.layouts import COLOURS
-from hrlspec.presets.preset import Preset
+from hrlspec.presets.preset import Fit, Preset
 from hrlspec.presets.recipes import Recipe, Settings, continuous
 from hrlspec.presets.suite_rules import (
     NUM_TASKS,
@@ -59,6 +59,13 @@ def zone(settings: Settings, recipe: Recipe) -> Settings:
 def _point_mass(settings: Settings, recipe: Recipe) -> Settings:
     """The peers' point mass, which stops and turns at once: half as many steps."""
     return zone(settings, recipe).evolve({"config.total_steps": 5_000_000})
+
+
+def _vanishing(world: Fit, settings: Settings, recipe: Recipe) -> Settings:
+    """A world where touching one colour makes another vanish."""
+    settings = world(settings, recipe)
+    # Without, it went straight through the one on its way to the other even after 10 M steps.
+    return settings if recipe != "hrlspec" else settings.evolve({"config.network.exclusions": True})
 
 
 def _of_paper(settings: Settings) -> Settings:
@@ -140,11 +147,12 @@ def _where_one_vanishes(colours: Sequence[str], first: str, second: str) -> dict
     return {"dag": dag, "order": order}
 
 
-def _preset(name: str, suites: Mapping[str, SuiteRule], *, peers: bool = False) -> Preset:
+def _preset(name: str, suites: Mapping[str, SuiteRule], *, peers: bool = False, vanishing: bool = False) -> Preset:
+    world = _point_mass if peers else zone
     return Preset(
         name,
         functools.partial(envs_jax.make, name),
-        _point_mass if peers else zone,
+        functools.partial(_vanishing, world) if vanishing else world,
         zone_with_bonuses,
         bonuses=_POINT_MASS_BONUSES if peers else _BONUSES,
         learning_rates=_LEARNING_RATES,
@@ -154,6 +162,8 @@ def _preset(name: str, suites: Mapping[str, SuiteRule], *, peers: bool = False) 
 
 ZONE = _preset("zone", {"dag": _DAG, "reach_avoid": REACH_AVOID, "reach": REACH})
 ZONE_LTL2ACTION = _preset("zone-ltl2action", {"dag": _DAG})
-ZONE_NM = _preset("zone-nm", _where_one_vanishes(COLOURS, "blue", "green"))
+ZONE_NM = _preset("zone-nm", _where_one_vanishes(COLOURS, "blue", "green"), vanishing=True)
 ZONE_JAXOLOTL = _preset("zone-jaxolotl", {"dag": _DAG}, peers=True)
-ZONE_NM_JAXOLOTL = _preset("zone-nm-jaxolotl", _where_one_vanishes(point_mass.COLOURS, "purple", "green"), peers=True)
+ZONE_NM_JAXOLOTL = _preset(
+    "zone-nm-jaxolotl", _where_one_vanishes(point_mass.COLOURS, "purple", "green"), peers=True, vanishing=True
+)
