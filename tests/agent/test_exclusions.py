@@ -84,7 +84,8 @@ def test_owed_is_what_all_ways_have_in_common(seed: int) -> None:
 
     def ways(node: int) -> list[np.ndarray]:
         below = [k for k in range(tree.num_nodes) if tree.valid[k] and tree.parent[k] == node]
-        return [tree.reach[node] | way for k in below for way in ways(k)] or [tree.reach[node]]
+        here = np.asarray(tree.reach[node])
+        return [here | way for k in below for way in ways(k)] or [here]
 
     found = np.asarray(owed(tree))
     for node in np.flatnonzero(tree.valid & (tree.parent >= 0)):
