@@ -225,7 +225,13 @@ def test_another_formula_needs_no_compilation() -> None:
 @pytest.mark.parametrize("name", peer_suites())
 def test_published_formulas_can_be_carried_out(name: str) -> None:
     """In their world, whose labels are the peers'; nothing asks for a step on which nothing holds."""
-    worlds = {"flatworld": "flatworld", "letter": "letter12", "deepltl/zone": "zone", "jaxolotl/zone": "zone-jaxolotl"}
+    worlds = {
+        "flatworld": "flatworld",
+        "letter": "letter12",
+        "deepltl/zone": "zone",
+        "jaxolotl/zone": "zone-jaxolotl",
+        "jaxolotl_blue/zone": "zone-nm",
+    }
     env = envs_jax.make(next(world for part, world in worlds.items() if part in name))
     suite = ltl_suite(name, peer_formulas(name), env, forever=go_on_for_ever(name))
     assert len(suite) >= 2

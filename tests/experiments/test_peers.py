@@ -103,7 +103,7 @@ def test_page_says_which_formulas_are_left_out() -> None:
     scores = {Evaluation(world.runs(1)[0], suite): scored(suite, 0.5, None) for suite, world in suites.items()}
     said = [line for line in page({}, scores) if line.startswith("Formulas: ")]
     left_out = [suite for suite, line in zip(suites, said, strict=True) if "ask to stay, are left out" in line]
-    assert left_out == ["jaxolotl/zone_nm_infinite", "deepltl/zone_infinite"]
+    assert left_out == ["jaxolotl/zone_nm_infinite", "deepltl/zone_infinite", "jaxolotl_blue/zone_nm_infinite"]
 
 
 def test_page_of_chains() -> None:
