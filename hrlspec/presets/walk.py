@@ -70,7 +70,7 @@ def overlapping(settings: Settings, recipe: Recipe) -> Settings:
             "config.network.forbidden": True,
             "config.network.critic_encoder": True,
             "config.network.chart": (64, 64, 16),
-            # Without them twice as many sub-tasks beside an edge or in a narrow gap are violated.
+            # Without them twice as many unseen tasks are violated.
             "config.network.waves": 4,
             "config.network.encoder_mlp": (128,),
             "config.network.actor": (128, 128),
