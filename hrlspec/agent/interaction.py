@@ -217,7 +217,7 @@ def _progress(
         state = jax.vmap(advance)(task_of(book, worker.task), worker.task_state, labels, edge)
         lost = jnp.take_along_axis(state.blocked, edge[:, None], 1)[:, 0]
         return worker.task, state, state.node != worker.task_state.node, lost, jnp.zeros_like(lost)
-    task, accepted = jax.vmap(book.automata.advance)(worker.task, labels)
+    task, accepted = jax.vmap(book.automata.advance)(worker.task, labels, edge)
     state = dataclasses.replace(jax.vmap(initial)(task_of(book, task)), status=book.automata.status[task])
     return task, state, (task != worker.task) | accepted, jnp.zeros_like(accepted), accepted
 

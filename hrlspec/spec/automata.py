@@ -1,7 +1,8 @@
 """Tasks as automata, inside the jit: the states of all of them are rows of one table, each with a task tree.
 
 A state is what a row of a book of tasks is: when an automaton moves, its task goes on as another one. What the tree
-says of blocked edges and of the order of sub-tasks does not count: the automaton rules.
+says of blocked edges and of the order of sub-tasks does not count: the automaton rules. Where it leaves a choice, which
+sub-task the agent pursues decides.
 
 Axes: **R** states of all automata, **L** labels, **M** automata, **P** atomic propositions.
 """
@@ -39,6 +40,8 @@ class Automata:
         column: int32 ``[2^P]``, which label a set of propositions is, bit i for proposition i; -1 for one that cannot
             occur.
         start: int32 ``[M]``, the row where each task begins.
+        origin: int32 ``[R, N]``, the row that reads what meets each edge: the row itself, unless the edge begins with a
+            jump; see `hrlspec.spec.unfold.Unfolded`.
     """
 
     trees: TaskTree
@@ -47,10 +50,24 @@ class Automata:
     accepts: Bool[Array, "R L"]
     column: Int32[Array, " _"]
     start: Int32[Array, " M"]
+    origin: Int32[Array, "R N"]
 
-    def advance(self, row: Int32[Array, ""], labels: Bool[Array, " P"]) -> tuple[Int32[Array, ""], Bool[Array, ""]]:
-        """See `advance`."""
-        return advance(self.successors, self.accepts, self.column, row, labels)
+    def advance(
+        self, row: Int32[Array, ""], labels: Bool[Array, " P"], edge: Int32[Array, ""] | int = TaskTree.NO_NODE
+    ) -> tuple[Int32[Array, ""], Bool[Array, ""]]:
+        """See `advance`; a jump is taken where the edge that is assigned begins with one, is met, and violates nothing.
+
+        Args:
+            row: int32 ``[]``, where a task stands.
+            labels: bool ``[P]``, the propositions that hold now.
+            edge: int32 ``[]``, the edge that is assigned.
+        """
+        tables = self.successors, self.accepts, self.column
+        stays = advance(*tables, row, labels)
+        jumps = advance(*tables, jnp.asarray(self.origin)[row, edge], labels)
+        met = (edge != TaskTree.NO_NODE) & (labels | ~jnp.asarray(self.trees.reach)[row, edge]).all()
+        taken = met & (jnp.asarray(self.status)[jumps[0]] != VIOLATED)
+        return jnp.where(taken, jumps[0], stays[0]), jnp.where(taken, jumps[1], stays[1])
 
     def padded(self, num_rows: int) -> Automata:
         """The same with ``num_rows`` rows, numpy leaves: copies of the last one are added, which nothing leads to."""
@@ -59,7 +76,7 @@ class Automata:
         def pad(x: Array) -> np.ndarray:
             return np.pad(x, [(0, missing)] + [(0, 0)] * (x.ndim - 1), mode="edge")
 
-        rows = {name: getattr(self, name) for name in ("trees", "successors", "status", "accepts")}
+        rows = {name: getattr(self, name) for name in ("trees", "successors", "status", "accepts", "origin")}
         return Automata(**jax.tree.map(pad, rows), column=self.column, start=self.start)
 
 
@@ -118,7 +135,7 @@ def automata_of(
     if trees is None:
         unfolded = [unfold(automaton, propositions, max_nodes) for automaton in automata]
     else:
-        unfolded = [Unfolded(shown, np.zeros(1, bool), np.zeros(1, bool)) for shown in trees]
+        unfolded = [_as_shown(shown) for shown in trees]
     sizes = np.array([automaton.num_states for automaton in automata])
     start = np.concatenate([[0], np.cumsum(sizes)[:-1]])
     status = np.full(sizes.sum(), RUNNING, np.int32)
@@ -127,6 +144,7 @@ def automata_of(
             if state is not None:
                 status[first + state] = value
     successors = [first + automaton.successors for first, automaton in zip(start, automata, strict=True)]
+    origin = [first + one.origin for first, one in zip(start, unfolded, strict=True)]
     leaves: dict[str, Any] = {
         "trees": jax.tree.map(lambda *x: np.concatenate(x), *(one.trees for one in unfolded)),
         "successors": np.concatenate(successors).astype(np.int32),
@@ -136,12 +154,20 @@ def automata_of(
         ),
         "column": _columns(labels, propositions),
         "start": start.astype(np.int32),
+        "origin": np.concatenate(origin).astype(np.int32),
     }
     return (
         Automata(**leaves),
         np.array([one.cut.any() for one in unfolded]),
         np.array([one.silent.any() for one in unfolded]),
     )
+
+
+def _as_shown(trees: TaskTree) -> Unfolded:
+    """Of trees that were given: nothing is left out, and nothing begins with a jump."""
+    nothing = np.zeros(1, bool)
+    own = np.arange(len(trees.parent), dtype=np.int32)[:, None]
+    return Unfolded(trees, nothing, nothing, np.repeat(own, trees.parent.shape[1], 1))
 
 
 def _columns(labels: Iterable[Collection[str]], propositions: Sequence[str]) -> Int32[np.ndarray, " _"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hrlspec.spec.guards import transitions
+from hrlspec.spec.guards import JUMP, transitions
 from hrlspec.spec.ltl.automaton import Automaton
 
 
@@ -10,7 +10,7 @@ def to_dot(automaton: Automaton, name: str = "") -> str:
     """Text that ``dot`` and its like draw, with guards in the syntax of LTL (`hrlspec.spec.guards`).
 
     An arrow from nowhere leads to the initial state; the accepting state has a double outline, the rejecting one a
-    dashed outline; accepting transitions are bold, and marked ``{0}`` as in HOA.
+    dashed outline; accepting transitions are bold, and marked ``{0}`` as in HOA; jumps are dashed.
 
     Args:
         automaton: of a finite task, or of one that goes on for ever.
@@ -22,7 +22,8 @@ def to_dot(automaton: Automaton, name: str = "") -> str:
     lines += [f"  {state} [{shapes.get(state, '')}]" for state in range(automaton.num_states)]
     for source, target, accepting, guard in transitions(automaton):
         label = _quoted(guard + " {0}" * accepting)
-        lines.append(f"  {source} -> {target} [label={label}{', style=bold' * accepting}]")
+        style = ", style=bold" * accepting + ", style=dashed" * (guard == JUMP)
+        lines.append(f"  {source} -> {target} [label={label}{style}]")
     return "\n".join([*lines, "}", ""])
 
 

@@ -24,8 +24,8 @@ def draw_automaton(automaton: Automaton, ax: Axes | None = None) -> Figure:
     An arrow from nowhere leads to the initial state; the accepting state is green with a double outline, the rejecting
     one red. Arrows carry their guards (`hrlspec.spec.guards`), "∧" for and, "¬" for not, a disjunction on several
     lines; with "●" in front, and on a blue arrow, those of accepting transitions of a task that goes on for ever.
-    What leads back to the same state stands above it, behind "↻". Arrows out of states in which the task has ended are
-    left out.
+    A jump has "ε". What leads back to the same state stands above it, behind "↻". Arrows out of states in which the
+    task has ended are left out.
 
     Args:
         automaton: of `MAX_DRAWN` states at most.

@@ -17,6 +17,8 @@ import numpy as np
 from hrlspec.spec.ltl.automaton import Automaton
 
 Place = TypeVar("Place")
+JUMP = "ε"
+"""Stands for the guard of a jump, which reads no label."""
 
 
 class Transition(NamedTuple):
@@ -26,7 +28,7 @@ class Transition(NamedTuple):
         source: the state before.
         target: the state after.
         accepting: a round of a task that goes on for ever is complete.
-        guard: which labels, in the syntax of LTL; ``true`` for all that can occur.
+        guard: which labels, in the syntax of LTL; ``true`` for all that can occur, `JUMP` for a jump.
     """
 
     source: int
@@ -43,7 +45,7 @@ class _Cube(NamedTuple):
 
 
 def transitions(automaton: Automaton) -> list[Transition]:
-    """State by state; accepting transitions apart from others between the same states."""
+    """State by state; accepting transitions and jumps apart from others between the same states."""
     marks = np.zeros_like(automaton.successors) if automaton.marks is None else automaton.marks
     found = []
     for state in range(automaton.num_states):
@@ -52,6 +54,7 @@ def transitions(automaton: Automaton) -> list[Transition]:
             for label, target, marked in zip(automaton.labels, automaton.successors[state], marks[state], strict=True)
         }
         found += [Transition(state, *place, guard) for place, guard in guards(goes).items()]
+        found += [Transition(state, target, False, JUMP) for target in automaton.origins(state)[1:]]
     return found
 
 

@@ -1,21 +1,20 @@
 """Automata in the Hanoi Omega-Automata format, version 1, as Spot, Owl and Rabinizer print them: in and out.
 
-What is read: deterministic Büchi automata, with acceptance on transitions or on states, complete or not. Of limit-
-deterministic ones, whose jumps an agent would have to choose, nothing is read.
+What is read: Büchi automata with acceptance on transitions or on states, complete or not, deterministic or not, such as
+limit-deterministic ones. Choices become jumps: to where an edge without a label leads, as Rabinizer prints what takes
+no step; or, where several edges are open to a label, to a state that takes another one of them.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import itertools
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from typing import TypeAlias
+from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Bool
 
+from hrlspec.spec.choices import Edge, Guard, Label, with_jumps
 from hrlspec.spec.ltl.automaton import Automaton
+from hrlspec.spec.ltl.merging import merged
 from hrlspec.spec.ltl.translate import MAX_STATES, minimal
 from hrlspec.spec.syntax import Position, SpecError
 from hrlspec.spec.tokens import END, Cursor, Token
@@ -29,17 +28,6 @@ _TOKEN = re.compile(
 _SPACE = re.compile(r"(?:\s+|/\*.*?\*/)+", re.DOTALL)
 _BUCHI = ["1", "Inf", "(", "0", ")"]
 
-Label: TypeAlias = frozenset[str]
-_Guard: TypeAlias = Callable[[Label], bool]
-
-
-@dataclasses.dataclass(frozen=True)
-class _Edge:
-    position: Position
-    guard: _Guard
-    target: int
-    marked: bool
-
 
 def from_hoa(text: str, propositions: Sequence[str], possible_labels: Iterable[Collection[str]]) -> Automaton:
     """Reads an automaton whose accepting transitions count.
@@ -50,38 +38,15 @@ def from_hoa(text: str, propositions: Sequence[str], possible_labels: Iterable[C
         possible_labels: the sets of propositions that can hold together.
 
     Raises:
-        SpecError: with line and column: what is no HOA, is not deterministic under the possible labels, accepts
-            otherwise than Büchi, or names other propositions; or there are too many states.
+        SpecError: with line and column: what is no HOA, accepts otherwise than Büchi, or names other propositions; or
+            there are too many states.
     """
     if len(text) > MAX_TEXT:
         raise SpecError(f"the text has {len(text):,} characters, at most {MAX_TEXT:,} are read", 1, 1)
-    parser = _Parser(_tokens(text), propositions)
-    start, states = parser.whole()
+    start, states = _Parser(_tokens(text), propositions).whole()
     labels = tuple(dict.fromkeys(map(frozenset, possible_labels)))
-    numbers, order = {start: 0}, [start]
-    sink = len(states)
-    successors, marks = [], []
-    for state in order:  # Grows while it is read.
-        row, marked = [], []
-        for label in labels:
-            edge = _taken(state, states[state], label) if state != sink else None
-            target = sink if edge is None else edge.target
-            if target not in numbers:
-                numbers[target] = len(order)
-                order.append(target)
-            row.append(numbers[target])
-            marked.append(edge is not None and edge.marked)
-        successors.append(row)
-        marks.append(marked)
-    table, accepts = np.array(successors, np.int32), np.array(marks)
-    alive: Bool[np.ndarray, " Q"] = np.asarray(accepts.any(1))
-    while not np.array_equal(wider := alive | alive[table].any(1), alive):
-        alive = wider
-    dead = np.flatnonzero(~alive)
-    if len(dead):  # whatever accepts nothing any more is one state
-        table[np.isin(table, dead)] = dead[0]
-        table[dead] = dead[0]
-    return Automaton(labels, table, None, int(dead[0]) if len(dead) else None, accepts & alive[:, None])
+    successors, marks, jumps, rejecting = merged(*with_jumps(start, states, labels))
+    return Automaton(labels, successors, None, rejecting, marks, jumps if any(jumps) else ())
 
 
 def until_accepting(automaton: Automaton) -> Automaton:
@@ -89,8 +54,13 @@ def until_accepting(automaton: Automaton) -> Automaton:
 
     Args:
         automaton: with accepting transitions.
+
+    Raises:
+        SpecError: it has jumps.
     """
     assert automaton.marks is not None
+    if automaton.jumps:
+        raise SpecError("the automaton leaves choices, which are for tasks that go on for ever")
     # Its states are numbered anew: 0 is the initial one, 1 where it is satisfied.
     number = np.array([0, *range(2, automaton.num_states + 1)])
     table = np.where(automaton.marks, 1, number[automaton.successors])
@@ -102,7 +72,7 @@ def until_accepting(automaton: Automaton) -> Automaton:
 def to_hoa(automaton: Automaton, name: str = "") -> str:
     """Text of an automaton; of a finite task every transition into the accepting state accepts, and so all that follow.
 
-    Labels that cannot occur have no transition.
+    Labels that cannot occur have no transition; jumps are edges without a label.
     """
     names = sorted(frozenset().union(*automaton.labels))
     place = {proposition: number for number, proposition in enumerate(names)}
@@ -114,7 +84,8 @@ def to_hoa(automaton: Automaton, name: str = "") -> str:
 
     lines = ["HOA: v1", *([f'name: "{name}"'] if name else []), f"States: {automaton.num_states}", "Start: 0"]
     lines += [" ".join(["AP:", str(len(names)), *(f'"{x}"' for x in names)])]
-    lines += ["acc-name: Buchi", "Acceptance: 1 Inf(0)", "properties: trans-acc deterministic", "--BODY--"]
+    kind = "" if automaton.jumps else " deterministic"
+    lines += ["acc-name: Buchi", "Acceptance: 1 Inf(0)", f"properties: trans-acc{kind}", "--BODY--"]
     for state in range(automaton.num_states):
         lines.append(f"State: {state}")
         groups: dict[tuple[int, bool], list[str]] = {}
@@ -123,17 +94,8 @@ def to_hoa(automaton: Automaton, name: str = "") -> str:
             groups.setdefault(key, []).append(guard(label))
         for (target, marked), guards in groups.items():
             lines.append(f"[{' | '.join(guards)}] {target}{' {0}' if marked else ''}")
+        lines += [str(target) for target in (automaton.jumps[state] if automaton.jumps else ())]
     return "\n".join([*lines, "--END--", ""])
-
-
-def _taken(state: int, edges: Sequence[_Edge], label: Label) -> _Edge | None:
-    """The edge that a label takes."""
-    open_edges = [edge for edge in edges if edge.guard(label)]
-    for one, other in itertools.pairwise(open_edges):
-        if (one.target, one.marked) != (other.target, other.marked):
-            shown = ", ".join(sorted(label))
-            raise other.position.error(f"a second transition of state {state} for {{{shown}}}, expected one alone")
-    return open_edges[0] if open_edges else None
 
 
 def _tokens(text: str) -> list[Token]:
@@ -162,7 +124,7 @@ class _Parser(Cursor[Token]):
         super().__init__(tokens)
         self.known = propositions
         self.names: list[str] | None = None
-        self.aliases: dict[str, _Guard] = {}
+        self.aliases: dict[str, Guard] = {}
         self.start: int | None = None
         self.all_accept = False
 
@@ -180,7 +142,7 @@ class _Parser(Cursor[Token]):
             raise token.unexpected(what)
         return int(token.text)
 
-    def whole(self) -> tuple[int, list[list[_Edge]]]:
+    def whole(self) -> tuple[int, list[list[Edge]]]:
         """The initial state, and the edges of each state."""
         self.take("'HOA:', with which an automaton begins", "HOA:")
         version = self.take("v1")
@@ -252,8 +214,8 @@ class _Parser(Cursor[Token]):
             found = " ".join(words) or "nothing"
             raise header.position.error(f"found the acceptance {found}, expected Büchi: 1 Inf(0)")
 
-    def body(self) -> dict[int, list[_Edge]]:
-        states: dict[int, list[_Edge]] = {}
+    def body(self) -> dict[int, list[Edge]]:
+        states: dict[int, list[Edge]] = {}
         while self.token.text == "State:":
             header = self.take()
             common = self.bracketed() if self.token.text == "[" else None
@@ -263,22 +225,25 @@ class _Parser(Cursor[Token]):
             if self.token.text.startswith('"'):
                 self.take()
             marked = self.marked()
-            states[state] = list(self.edges(common, marked))
+            states[state] = edges = list(self.edges(common, marked))
+            if edges and all(edge.guard is None for edge in edges):
+                raise edges[0].position.error("no transition of the state has a label: implicit ones are not read")
         if not states:
             raise self.token.unexpected("'State:'")
         return states
 
-    def edges(self, common: _Guard | None, marked: bool) -> Iterator[_Edge]:
+    def edges(self, common: Guard | None, marked: bool) -> Iterator[Edge]:
         while self.token.text == "[" or self.token.text.isdigit():
             position = self.token.position
             own = self.bracketed() if self.token.text == "[" else None
-            guard = own or common
-            if guard is None:
-                raise self.token.unexpected("a label in brackets: implicit ones are not read")
             target = self.number("the number of a state")
             if self.token.text == "&":
                 raise self.token.unexpected("one state: no alternation")
-            yield _Edge(position, guard, target, self.marked() or marked or self.all_accept)
+            accepts = self.marked() or marked
+            guard = own or common
+            if guard is None and accepts:
+                raise position.error("a transition without a label takes no step and cannot accept")
+            yield Edge(position, guard, target, guard is not None and (accepts or self.all_accept))
 
     def marked(self) -> bool:
         """Whether a set of acceptance sets follows, which can be that of the first alone."""
@@ -294,13 +259,13 @@ class _Parser(Cursor[Token]):
         self.take()
         return found
 
-    def bracketed(self) -> _Guard:
+    def bracketed(self) -> Guard:
         self.take(text="[")
         guard = self.guard()
         self.take("']'", "]")
         return guard
 
-    def guard(self, depth: int = 0) -> _Guard:
+    def guard(self, depth: int = 0) -> Guard:
         """A disjunction of conjunctions."""
         parts = [self.conjunction(depth)]
         while self.token.text == "|":
@@ -308,14 +273,14 @@ class _Parser(Cursor[Token]):
             parts.append(self.conjunction(depth))
         return parts[0] if len(parts) == 1 else lambda label: any(part(label) for part in parts)
 
-    def conjunction(self, depth: int) -> _Guard:
+    def conjunction(self, depth: int) -> Guard:
         parts = [self.literal(depth)]
         while self.token.text == "&":
             self.take()
             parts.append(self.literal(depth))
         return parts[0] if len(parts) == 1 else lambda label: all(part(label) for part in parts)
 
-    def literal(self, depth: int) -> _Guard:
+    def literal(self, depth: int) -> Guard:
         token = self.take("a label")
         if depth > _DEPTH:
             raise token.position.error(f"labels nested more than {_DEPTH} deep")

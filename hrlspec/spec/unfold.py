@@ -3,6 +3,7 @@
 In a state q that is a tree rooted at q: useful simple paths to acceptance (of a task that goes on for ever: to its next
 accepting transition), shortest first. A move is useful unless whatever is accepted after it would have been accepted
 without it. A sub-task's p₊ is the least that must hold for the automaton to move, its p₋ what takes the way on from it.
+A move may begin with a jump: the agent that chose it jumps where p₊ comes to hold, so that this is read after the jump.
 
 Axes: **Q** states, **L** labels, **N** tree nodes, **P** atomic propositions.
 """
@@ -17,7 +18,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int32
 
 from hrlspec.spec.ltl.automaton import Automaton
 from hrlspec.spec.tree import TaskTree
@@ -31,11 +32,13 @@ class Move(NamedTuple):
     Attributes:
         reach: p₊, propositions that hold together.
         avoid: p₋ without what other moves of the state reach.
+        origin: the state that reads it: that from which it is made, or one to which this jumps.
         target: the state that it leads to.
     """
 
     reach: Label
     avoid: Label
+    origin: int
     target: int
 
 
@@ -46,11 +49,14 @@ class Unfolded(NamedTuple):
         trees: leading axis Q; numpy leaves. In a state without moves the tree is a root without children.
         cut: bool ``[Q]``, paths were left out because N nodes are too few.
         silent: bool ``[Q]``, a way on is left out because it begins where nothing holds, which no sub-task can ask for.
+        origin: int32 ``[Q, N]``, of each edge at the root the state that reads what meets it: q, unless it begins with
+            a jump; q also for all other nodes.
     """
 
     trees: TaskTree
     cut: Bool[np.ndarray, " Q"]
     silent: Bool[np.ndarray, " Q"]
+    origin: Int32[np.ndarray, "Q N"]
 
 
 def unfold(automaton: Automaton, propositions: Sequence[str], max_nodes: int) -> Unfolded:
@@ -63,13 +69,17 @@ def unfold(automaton: Automaton, propositions: Sequence[str], max_nodes: int) ->
     """
     moves = _Moves(automaton if automaton.marks is None else _until_accepting(automaton, automaton.marks))
     rows, cut = [], []
+    origin = np.repeat(np.arange(automaton.num_states, dtype=np.int32)[:, None], max_nodes, 1)
     for state in range(automaton.num_states):
         nodes, complete = _paths(moves, state, max_nodes)
         rows.append(_tree(nodes, propositions, max_nodes))
         cut.append(not complete)
+        for number, path in enumerate(nodes):
+            if len(path) == 1:
+                origin[state, number] = path[0].origin
     trees: TaskTree = jax.tree.map(lambda *x: np.stack(x), *rows)
     silent = np.array([moves.silent(state) for state in range(automaton.num_states)])
-    return Unfolded(trees, np.array(cut), silent & ~_rests(automaton))
+    return Unfolded(trees, np.array(cut), silent & ~_rests(automaton), origin)
 
 
 def _rests(automaton: Automaton) -> Bool[np.ndarray, " Q"]:
@@ -87,7 +97,8 @@ def _until_accepting(automaton: Automaton, marks: Bool[np.ndarray, "Q L"]) -> Au
     accepting = automaton.num_states
     successors = np.where(marks, accepting, automaton.successors)
     successors = np.vstack([successors, np.full_like(successors[:1], accepting)])
-    return Automaton(automaton.labels, successors.astype(np.int32), accepting, automaton.rejecting)
+    jumps = (*automaton.jumps, ()) if automaton.jumps else ()
+    return Automaton(automaton.labels, successors.astype(np.int32), accepting, automaton.rejecting, jumps=jumps)
 
 
 class _Moves:
@@ -96,6 +107,7 @@ class _Moves:
     def __init__(self, automaton: Automaton) -> None:
         self.automaton = automaton
         self.after = {label: automaton.successors[:, column].tolist() for column, label in enumerate(automaton.labels)}
+        self.origins = [automaton.origins(state) for state in range(automaton.num_states)]
         self._known: dict[int, tuple[Move, ...]] = {}
         self.distance = self._distances()
         self.within = self._inclusions()
@@ -107,26 +119,37 @@ class _Moves:
         return self._known[state]
 
     def _found(self, state: int) -> tuple[Move, ...]:
-        targets: dict[int, list[Label]] = collections.defaultdict(list)
-        for label, after in self.after.items():
-            if label and self._is_useful(state, after[state]):
-                targets[after[state]].append(label)
+        ways: dict[tuple[int, int], list[Label]] = collections.defaultdict(list)
+        for label in self.after:
+            if label:
+                for way in self._ways(state, label):
+                    ways[way].append(label)
         moves = []
-        for target, labels in targets.items():
+        for (origin, target), labels in ways.items():
             least = [label for label in labels if not any(other < label for other in labels)]
-            moves += [Move(label, self._avoid(state, label, target), target) for label in least]
+            moves += [Move(label, self._avoid(state, label, origin, target), origin, target) for label in least]
         return tuple(sorted(moves, key=lambda move: (len(move.reach), sorted(move.reach))))
 
     def silent(self, state: int) -> bool:
         """Whether a useful move begins where nothing holds."""
-        nothing = self.after.get(frozenset())
-        return nothing is not None and self._is_useful(state, nothing[state])
+        nothing: Label = frozenset()
+        return nothing in self.after and bool(self._ways(state, nothing))
+
+    def _ways(self, state: int, label: Label) -> list[tuple[int, int]]:
+        """Useful moves by a label, as the states that read it and those that follow; of jumps, those worth a jump."""
+        after, found = self.after[label], list[tuple[int, int]]()
+        for origin in self.origins[state]:
+            target = after[origin]
+            if self._is_useful(state, target) and not any(self.within[target, other] for _, other in found):
+                found = [way for way in found if not self.within[way[1], target]]
+                found.append((origin, target))
+        return found
 
     def _is_useful(self, state: int, target: int) -> bool:
         """Whether acceptance can be reached after a move, and something is accepted that was not before."""
         return target in self.distance and not self.within[target, state]
 
-    def _avoid(self, state: int, reach: Label, target: int) -> Label:
+    def _avoid(self, state: int, reach: Label, origin: int, target: int) -> Label:
         """All that holds, besides p₊, where the automaton goes astray.
 
         That is where it does not go where p₊ leads to, although p₊ holds; and where it goes to a state from which p₊
@@ -134,22 +157,33 @@ class _Moves:
         """
         harmful = set()
         for label, after in self.after.items():
-            onward = after[state] if label >= reach else self.after[reach][after[state]]
-            if not self.within[target, onward]:
+            if label >= reach:
+                onward = [after[origin]]
+            else:
+                onward = [self.after[reach][other] for other in self.origins[after[state]]]
+            if not any(self.within[target, other] for other in onward):
                 harmful.add(label - reach)
+        # Where nothing at all holds cannot be avoided by avoiding something.
+        harmful.discard(frozenset())
         # Clear of the least that does harm it is clear of all that holds besides.
         return frozenset().union(*(some for some in harmful if not any(other < some for other in harmful)))
 
     def _inclusions(self) -> Bool[np.ndarray, "Q Q"]:
-        """Entry (q, r): all that is accepted from q is accepted from r; the largest such relation."""
+        """Entry (q, r): what is accepted from q is accepted from r, step by step; the largest such relation."""
         successors, states = self.automaton.successors, np.arange(self.automaton.num_states)
         accepting = states == self.automaton.accepting
         within = ~accepting[:, None] | accepting
         different = np.unique(successors.T, axis=0)  # many labels make no difference
+        jumping = [state for state in states.tolist() if len(self.origins[state]) > 1]
         while True:
             narrower = within.copy()
             for after in different:
-                narrower &= within[np.ix_(after, after)]
+                less = within[np.ix_(after, after)]
+                if jumping:
+                    less = np.column_stack([less[:, origins].any(1) for origins in self.origins])
+                narrower &= less
+            for state in jumping:
+                narrower[state] &= within[list(self.origins[state])].all(0)
             if np.array_equal(narrower, within):
                 return within
             within = narrower
@@ -162,9 +196,10 @@ class _Moves:
         found, queue = {accepting: 0}, collections.deque([accepting])
         before: dict[int, set[int]] = collections.defaultdict(set)
         for label, after in self.after.items():
-            for state, successor in enumerate(after):
-                if label and state != successor:
-                    before[successor].add(state)
+            for state, origins in enumerate(self.origins if label else ()):
+                for origin in origins:
+                    if state != after[origin]:
+                        before[after[origin]].add(state)
         while queue:
             state = queue.popleft()
             for earlier in before[state] - found.keys():

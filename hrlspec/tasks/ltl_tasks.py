@@ -82,7 +82,8 @@ class LtlTasks:
         """The padded automaton of a formula, numpy leaves.
 
         Raises:
-            SpecError: if the text is no formula, names unknown propositions or needs more than S states.
+            SpecError: if the text is no formula, names unknown propositions, needs more than S states, or leaves it
+                to the agent when something begins to hold for ever, which no action says.
         """
         table = _read(text, self)[1].padded(self.max_states)
         return LtlTask(table.successors, table.status, table.accepts, table.column)
@@ -126,6 +127,8 @@ class LtlTasks:
 def _read(text: str, language: LtlTasks) -> tuple[Automaton, Automata]:
     translate = to_buchi if language.forever else to_automaton
     automaton = translate(parse_ltl(text), language.propositions, language.labels)
+    if automaton.jumps:
+        raise SpecError("from when on something holds for ever is for the agent to say, and no action says it")
     if automaton.num_states > language.max_states:
         raise SpecError(f"the automaton has {automaton.num_states} states, at most {language.max_states} are taken")
     return automaton, automata_of([automaton], language.propositions, SHOWN_NODES)[0]

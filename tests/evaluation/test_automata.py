@@ -153,6 +153,19 @@ def test_rounds_of_a_task_that_goes_on() -> None:
     assert found.per_formula[0].no_round_rate.estimate == 0
 
 
+def test_what_persists_begins_with_a_jump() -> None:
+    """On the first a it jumps, after which every step clear of c is a round; b, in its way, costs nothing."""
+    suite = ltl_suite("some", "F (a & G !c)", LETTER, forever=True)
+    some, which, how = layouts(seed=9), np.zeros(COUNT, int), {"greedy": True}
+    episodes, trace = trace_episodes(KEY, WALKER, manner(), COMPLETION, suite.automata, some, which=which, **how)
+    labels = np.asarray(jax.vmap(jax.vmap(lambda state: LETTER.labels(state, LETTER.default_params)))(trace.env_state))
+    first = labels[:, :, NAMES.index("a")].argmax(0)  # entry t is what step t begins with
+    steps, rounds = np.asarray(episodes.steps), np.asarray(episodes.rounds)
+    np.testing.assert_array_equal(rounds + np.asarray(episodes.violated), steps - first + 1)
+    assert (steps[~np.asarray(episodes.violated)] == LETTER.horizon).all()
+    assert np.asarray(episodes.violated).mean() < 0.2
+
+
 def test_a_suite_of_formulas() -> None:
     """One that nothing satisfies, one that is satisfied at once, and one with a bad end that is avoided."""
     text = "# formulas\nfalse\nF (a | b | c | d | e | !a)\n\n!a U b  # clear of a\n"

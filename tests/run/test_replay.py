@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 
 from hrlspec import checkpoint
+from hrlspec.evaluation import ltl_suite
 from hrlspec.evaluation.episodes import Episodes
 from hrlspec.evaluation.recording import Deliberation, Record, Standing
 from hrlspec.run.commands import replay
 from hrlspec.run.errors import main_guard
 from hrlspec.run.folder import open_run
-from hrlspec.run.replay.data import Played, page_data
+from hrlspec.run.replay.data import Played, _automaton, page_data
 from hrlspec.run.replay.page import SCRIPTS, page
 from hrlspec.run.run_flags import experiments_of, parse_run
 from hrlspec.spec import TaskState
@@ -54,6 +55,16 @@ def test_the_data_say_what_was_recorded() -> None:
     names = {shape["name"] for shape in data["scenes"][0]["shapes"]}
     assert names == {*LETTER.propositions}
     assert len(data["scenes"]) == len(layouts) == EPISODES
+
+
+def test_jumps_are_among_the_moves() -> None:
+    suite = ltl_suite("some", "FG a", LETTER, forever=True)
+    moves = _automaton(suite.automata, LETTER.propositions)["moves"]
+    assert {(move["from"], move["to"], move["if"], move["accepts"]) for move in moves} == {
+        (0, 1, "ε", False),
+        (1, 1, "a", True),
+        (1, 2, "!a", False),
+    }
 
 
 def test_an_automaton_comes_with_its_moves_and_the_trees_of_the_states_that_were_visited() -> None:
@@ -155,7 +166,7 @@ BAD_FLAGS: list[tuple[Sequence[str], str]] = [
     ((*TO, *ONE, "--spec", ""), "found no formula"),
     ((*TO, *ONE, "--spec", "achieve z"), "--spec, line 1, column 9"),
     ((*TO, *ONE, "--ltl", "F (a"), "--ltl, line 1, column 5"),
-    ((*TO, *ONE, "--ltl", "FG a", "--forever"), "F G a asks to stay for ever"),
+    ((*TO, *ONE, "--ltl", "GF (a & G b)", "--forever"), "G F (a & G b) is none of what is read for ever"),
     ((*TO, *ONE, "--spec", "achieve a", "--episodes", "0"), "--episodes is 0"),
     ((*TO, *ONE, "--spec", "achieve a", "--episodes", "51"), "--episodes is 51"),
     ((*TO, *ONE, "--spec", "achieve a", "--seed", "-1"), "--seed is -1"),

@@ -125,10 +125,14 @@ def test_a_formula_means_what_the_page_says(lines: list[str]) -> None:
 
 @pytest.mark.parametrize("lines", _blocks("tasks.md", "forever"), ids=" | ".join)
 def test_rounds_are_as_many_as_the_page_says(lines: list[str]) -> None:
+    """Where it has ε the automaton jumps."""
     automaton, (trace, said) = to_buchi(parse_ltl(lines[0]), "abcd", LABELS), _split(lines[1])
     assert automaton.marks is not None
+    before_jump = [len(re.findall(r"\{", part)) for part in lines[1].split("ε")[:-1]]
     state = rounds = 0
-    for label in trace:
+    for step, label in enumerate(trace):
+        if step in before_jump:
+            (state,) = automaton.jumps[state]
         column = automaton.labels.index(frozenset(label))
         rounds += bool(automaton.marks[state, column])
         state = int(automaton.successors[state, column])

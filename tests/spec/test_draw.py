@@ -69,6 +69,7 @@ def test_an_automaton_carries_short_guards() -> None:
     assert texts == {*"01234", "", *"abcd", "↻ ¬a∧¬b", "↻ ¬a∧¬c∧¬d", "↻ ¬c∧¬d"}
     texts = _texts(draw_automaton(to_buchi(parse_ltl("GF (a | b) & GF c"), NAMES, labels)))
     assert {"a ∨\nb", "● c"} <= texts
+    assert "ε" in _texts(draw_automaton(to_buchi(parse_ltl("FG a"), NAMES, labels)))
     one = draw_automaton(to_buchi(parse_ltl("GF a"), NAMES, labels))
     assert "↻ ¬a\n● a" in _texts(one)
     figure = Figure()

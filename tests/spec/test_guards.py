@@ -87,6 +87,13 @@ def _least(on: frozenset[frozenset[str]], labels: frozenset[frozenset[str]]) -> 
     raise AssertionError
 
 
+def test_jumps_are_transitions_without_a_guard() -> None:
+    automaton = to_buchi(parse_ltl("FG a"), "abcde", ONE)
+    expected = [(0, 0, "true"), (0, 1, "ε"), (1, 1, "a !"), (1, 2, "!a"), (2, 2, "true")]
+    assert sorted(guards(automaton)) == expected
+    assert '  0 -> 1 [label="ε", style=dashed]' in to_dot(automaton).splitlines()
+
+
 def test_text_for_graphviz() -> None:
     text = to_dot(to_buchi(parse_ltl("GF a & G !c"), "abcde", ONE), 'GF a & G !c "')
     assert (

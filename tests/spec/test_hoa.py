@@ -10,6 +10,7 @@ import pytest
 from hrlspec.spec import RUNNING, SATISFIED, VIOLATED, SpecError
 from hrlspec.spec.hoa import from_hoa, to_hoa, until_accepting
 from hrlspec.spec.ltl import Automaton, parse_ltl, to_automaton, to_buchi
+from tests.spec.ltl.test_buchi import accepts, holds
 
 NAMES = ("a", "b", "c")
 LABELS = (frozenset(), *(frozenset(name) for name in NAMES))
@@ -70,14 +71,66 @@ def test_a_finite_task_is_satisfied_with_the_first_accepting_transition() -> Non
 
 
 @pytest.mark.parametrize(
-    "text", ["GF a & GF (b & F c)", "G (a -> F b) & GF c", "(!a U b) & GF c", "G !a", "GF a | GF b"]
+    "text",
+    [
+        "GF a & GF (b & F c)",
+        "G (a -> F b) & GF c",
+        "(!a U b) & GF c",
+        "G !a",
+        "GF a | GF b",
+        "FG a",
+        "FG a & GF b | FG (b | c)",
+        "F (a & GF b & G !c) & FG !a",
+    ],
 )
 def test_what_is_written_is_read_again(text: str) -> None:
     automaton = to_buchi(parse_ltl(text), NAMES, LABELS)
     again = from_hoa(to_hoa(automaton, text), NAMES, LABELS)
     np.testing.assert_array_equal(again.successors, automaton.successors)
     np.testing.assert_array_equal(again.marks, automaton.marks)
-    assert again.rejecting == automaton.rejecting
+    assert (again.rejecting, again.jumps) == (automaton.rejecting, automaton.jumps)
+
+
+# FG a, limit-deterministic in two ways: with a transition that takes no step, and with a second one open to a.
+STAY = """HOA: v1 States: 2 Start: 0 AP: 1 "a" Acceptance: 1 Inf(0) --BODY--
+State: 0 [t] 0 %s
+State: 1 [0] 1 {0}
+--END--"""
+# Whether b or c is to come again and again is chosen with an a, which without a choice is the former.
+WHICH = """HOA: v1 States: 3 Start: 0 AP: 3 "a" "b" "c" Acceptance: 1 Inf(0) --BODY--
+State: 0 [!0] 0 [0] 1 [0] 2
+State: 1 [!1] 1 [1] 1 {0}
+State: 2 [!2] 2 [2] 2 {0}
+--END--"""
+
+
+@pytest.mark.parametrize("choice", ["1", "[0] 1"])
+def test_limit_deterministic_automata(choice: str) -> None:
+    """Another transition for the same label is taken after a jump to a state that reads this label alone."""
+    automaton = from_hoa(STAY % choice, NAMES, LABELS)
+    (copy,) = automaton.jumps[0]
+    assert automaton.successors[0].tolist() == [0] * 4
+    after = automaton.successors[copy]
+    assert [int(after[column]) == automaton.rejecting for column in range(4)] == [True, False, True, True]
+    stayed = int(after[1])
+    assert automaton.marks is not None
+    assert (automaton.marks[stayed, 1], int(automaton.successors[stayed, 1])) == (True, stayed)
+    with pytest.raises(SpecError, match="the automaton leaves choices, which are for tasks that go on for ever"):
+        until_accepting(automaton)
+
+
+def test_choices_of_a_given_automaton_are_its_language() -> None:
+    """Against F (a & X ...) with the one or the other, on random words that repeat."""
+    rng = random.Random(0)
+    automaton = from_hoa(WHICH, NAMES, LABELS)
+    once = parse_ltl("F a & (GF b | GF c)")
+    outcomes = []
+    for _ in range(300):
+        word = [rng.choice(LABELS) for _ in range(rng.randrange(1, 7))]
+        loop = rng.randrange(len(word))
+        outcomes.append(holds(once, word, loop)[0])
+        assert accepts(automaton, word, loop) == outcomes[-1], (word, loop)
+    assert 0.2 < np.mean(outcomes) < 0.8
 
 
 @pytest.mark.parametrize("text", ["F (a & F b)", "!a U (b & (!c U a))", "F a & F b & G !c"])
@@ -102,12 +155,12 @@ def test_finite_tasks_too(text: str) -> None:
         ("1 Inf(0)", "1 Fin(0)", "found the acceptance 1 Fin ( 0 ), expected Büchi: 1 Inf(0)"),
         ("1 Inf(0)", "2 Inf(0)&Inf(1)", "expected Büchi"),
         ("[!1] 0", "[!1] 0 {1}", "the acceptance set of a Büchi automaton"),
-        ("[!1] 0", "[t] 0", "a second transition of state 0 for {a}, expected one alone"),
         ("[!1] 0", "[!2] 0", "found '2', expected a label: t, f, !, an alias, or a number below 2"),
         ("[!1] 0", "[!1 0", "found '0', expected ']'"),
         ("[!1] 0", "[!1] 5", "found no state 5, to which a transition leads"),
         ("[!1] 0", "[!1] 0 & 1", "no alternation"),
-        ("[!1] 0", "0", "implicit ones are not read"),
+        ("[!0] 1\n[(0 | f) & t] 0 {0}", "1 0", "no transition of the state has a label: implicit ones are not read"),
+        ("[!1] 0", "0 {0}", "a transition without a label takes no step and cannot accept"),
         ("[!1] 0", "[" + "(" * 300 + "0" + ")" * 300 + "] 0", "nested more than 200 deep"),
         ("State: 1", "State: 0", "state 0 is there twice"),
         ("--END--", "", "found the end of the text, expected '--END--'"),

@@ -13,8 +13,9 @@ import envs_jax
 from hrlspec.spec import RUNNING, SATISFIED, VIOLATED, TaskTree, compile_task, parse, subtask_avoid
 from hrlspec.spec.automata import automata_of
 from hrlspec.spec.ltl import Automaton, parse_ltl, satisfies_ltl, to_automaton, to_buchi
-from hrlspec.spec.unfold import unfold
+from hrlspec.spec.unfold import Unfolded, unfold
 from tests.spec.ltl.test_automaton import random_formula
+from tests.spec.ltl.test_buchi import random_round
 
 NAMES = ("a", "b", "c", "d")
 ONE = (frozenset(), *(frozenset({name}) for name in NAMES))
@@ -174,6 +175,69 @@ def test_advancing_is_running_the_automata() -> None:
             assert accepted == (int(np.asarray(together.status)[rows[i]]) == SATISFIED)
     both = np.ones((len(each), 4), bool)
     np.testing.assert_array_equal(advance(rows, both)[0], rows)
+
+
+def forever(text: str) -> tuple[Automaton, Unfolded]:
+    some = to_buchi(parse_ltl(text), NAMES, ONE)
+    return some, unfold(some, NAMES, 8)
+
+
+def test_a_sub_task_may_begin_with_a_jump() -> None:
+    """F G a: a, with the jump; in the copy nothing but a. Once c is met: before it, no jump is worth anything."""
+    some, shown = forever("FG a & F c")
+    (jumping,) = [state for state in range(some.num_states) if some.jumps[state]]
+    (copy,) = some.jumps[jumping]
+    for state, avoided, origin in ((jumping, "", copy), (copy, "bcd", copy)):
+        tree = jax.tree.map(lambda x, state=state: x[state], shown.trees)
+        assert tree.valid.sum() == 2
+        assert [name for name, reached in zip(NAMES, tree.reach[1], strict=True) if reached] == ["a"]
+        assert "".join(name for name, avoided in zip(NAMES, tree.avoid[1], strict=True) if avoided) == avoided
+        assert shown.origin[state].tolist() == [state, origin, *[state] * 6]
+    first = jax.tree.map(lambda x: x[0], shown.trees)
+    assert first.reach[[1, 2]].tolist() == [[False, False, True, False], [True, False, False, False]]
+    assert (shown.origin[0] == 0).all()
+
+
+def test_a_jump_is_taken_where_its_sub_task_is_pursued_and_met() -> None:
+    """Pursued in vain or met by chance, the task waits; after the jump it must hold."""
+    _, shown = forever("FG a | FG b")
+    together, *_ = automata_of([to_buchi(parse_ltl("FG a | FG b"), NAMES, ONE)], NAMES, 8)
+    reach = shown.trees.reach[0]
+    edge = {name: next(n for n in (1, 2) if reach[n, NAMES.index(name)]) for name in "ab"}
+
+    def step(row: int, name: str, edge: int) -> tuple[int, bool]:
+        after, accepted = together.advance(row, np.array([name == other for other in NAMES]), edge)
+        return int(after), bool(accepted)
+
+    assert step(0, "c", edge["a"]) == step(0, "b", edge["a"]) == step(0, "a", TaskTree.NO_NODE) == (0, False)
+    row, accepted = step(0, "a", edge["a"])
+    assert accepted
+    assert step(row, "a", TaskTree.NO_NODE) == (row, True)
+    after, accepted = step(row, "c", TaskTree.NO_NODE)
+    assert not accepted
+    assert int(together.status[after]) == RUNNING  # there is still b to stay in
+    after, accepted = step(after, "b", 1)
+    assert accepted
+    assert int(together.status[step(after, "a", 1)[0]]) == VIOLATED
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_what_an_agent_makes_of_jumps_is_a_run_of_the_automaton(seed: int) -> None:
+    """Whatever it pursues and whatever comes: each step reads the label where the task stands or after a jump."""
+    rng = random.Random(seed)
+    formula = random_round(rng, 2)
+    some = to_buchi(formula, NAMES, ONE)
+    together, *_ = automata_of([some], NAMES, 16)
+    advance = jax.jit(together.advance)
+    row, column_of = 0, {label: column for column, label in enumerate(some.labels)}
+    for _ in range(40):
+        edges = np.flatnonzero(together.trees.parent[row] == 0).tolist()
+        edge, label = rng.choice([*edges, TaskTree.NO_NODE]), rng.choice(ONE)
+        after, accepted = advance(row, np.array([name in label for name in NAMES]), edge)
+        ways = [(origin, column_of[label]) for origin in (some.origins(row) if edge in edges else (row,))]
+        assert (int(after), bool(accepted)) in [(some.successors[way], some.marks[way]) for way in ways]  # type: ignore[index]
+        assert int(after) != some.rejecting or int(some.successors[row, column_of[label]]) == some.rejecting
+        row = int(after)
 
 
 def test_what_cannot_be_put_together() -> None:

@@ -57,6 +57,8 @@ def test_what_is_refused() -> None:
         FINITE.read("F a & F b & F c & F d")
     with pytest.raises(SpecError, match="'z' is no proposition"):
         FINITE.read("F z")
+    with pytest.raises(SpecError, match="from when on something holds for ever is for the agent to say"):
+        FOREVER.read("FG a")
     with pytest.raises(ValueError, match="unknown language 'latin', expected one of: spectrl, ltl, ltl forever"):
         hrlspec.gymnasium.make("letter", language="latin")  # type: ignore[arg-type]
 

@@ -76,7 +76,7 @@ class EvaluateFlags(Checked):
     ltl_file: Path | None = None
     """A file with one such formula a line."""
     hoa: Path | None = None
-    """A file with an automaton in the Hanoi Omega-Automata format, deterministic Büchi."""
+    """A file with a Büchi automaton in the Hanoi Omega-Automata format."""
     dfa: Path | None = None
     """A file with an automaton as the library dfa has it: json.dumps(dfa2dict(...))."""
     forever: bool = False
@@ -236,10 +236,10 @@ def _of_automaton(file: Path, flags: EvaluateFlags, env: Environment) -> LtlSuit
     read = from_hoa if flags.dfa is None else from_json
     try:
         automaton = read(_read(file), env.propositions, env.possible_labels)
+        if automaton.marks is not None and not flags.forever:
+            automaton = until_accepting(automaton)
     except SpecError as error:
         raise SpecError(error.message, error.line, error.column, file.name) from None
-    if automaton.marks is not None and not flags.forever:
-        automaton = until_accepting(automaton)
     return suite_of_automata(file.name, [file.name], [automaton], env, max_nodes=min(flags.max_nodes, LTL_NODES))
 
 

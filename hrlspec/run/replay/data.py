@@ -22,7 +22,7 @@ from hrlspec.evaluation.episodes import Episodes
 from hrlspec.evaluation.recording import Record, Standing
 from hrlspec.spec import RUNNING, SATISFIED, VIOLATED, TaskTree, subtask_avoid
 from hrlspec.spec.automata import Automata
-from hrlspec.spec.guards import guards
+from hrlspec.spec.guards import JUMP, guards
 
 Json = dict[str, Any]
 
@@ -161,6 +161,7 @@ def _automaton(automata: Automata, names: Sequence[str]) -> Json:
         for code in np.flatnonzero(column >= 0).tolist()
     }
     status, successors, accepts = map(np.asarray, (automata.status, automata.successors, automata.accepts))
+    origins = np.asarray(automata.origin)
     moves, states = [], [int(automata.start[0])]
     for state in states:  # grows while it is read
         if status[state] != RUNNING:
@@ -171,6 +172,10 @@ def _automaton(automata: Automata, names: Sequence[str]) -> Json:
                 states.append(target)
             if target != state or accepting:
                 moves.append({"from": state, "to": target, "if": text, "accepts": accepting})
+        for origin in dict.fromkeys(origins[state][origins[state] != state].tolist()):
+            if origin not in states:
+                states.append(origin)
+            moves.append({"from": state, "to": origin, "if": JUMP, "accepts": False})
     return {
         "satisfied": [state for state in states if status[state] == SATISFIED],
         "violated": [state for state in states if status[state] == VIOLATED],

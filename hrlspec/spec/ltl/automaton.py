@@ -16,7 +16,8 @@ from hrlspec.spec.monitor import RUNNING, SATISFIED, VIOLATED
 class Automaton:
     """States 0 to Q - 1, of which 0 is where a trace begins; what has been accepted or rejected stays so.
 
-    Of a task that goes on for ever accepting transitions count, and no state is accepting.
+    Of a task that goes on for ever accepting transitions count, and no state is accepting. Such a task may leave
+    choices: a jump from one state to another takes no step, reads no label and never accepts.
 
     Axes: **Q** states, **L** labels.
 
@@ -26,6 +27,7 @@ class Automaton:
         accepting: the state in which the task is satisfied; ``None`` if it can never be.
         rejecting: the state from which it cannot be satisfied any more; ``None`` if there is none.
         marks: bool ``[Q, L]``, the accepting transitions of a task that goes on for ever; else ``None``.
+        jumps: the states to which each state may jump, one tuple a state; empty where there is no choice at all.
     """
 
     labels: tuple[frozenset[str], ...]
@@ -33,11 +35,19 @@ class Automaton:
     accepting: int | None
     rejecting: int | None
     marks: Bool[np.ndarray, "Q L"] | None = None
+    jumps: tuple[tuple[int, ...], ...] = ()
 
     @property
     def num_states(self) -> int:
         """Q."""
         return len(self.successors)
+
+    def origins(self, state: int) -> tuple[int, ...]:
+        """The states that may read the next label: the state itself, then all that jumps lead to."""
+        found = [state]
+        for origin in found if self.jumps else ():  # Grows while it is read.
+            found += [target for target in self.jumps[origin] if target not in found]
+        return tuple(found)
 
     @functools.cached_property
     def _column(self) -> Mapping[frozenset[str], int]:
@@ -45,6 +55,8 @@ class Automaton:
 
     def run(self, trace: Iterable[Collection[str]]) -> int:
         """How the task stands after a trace: the propositions that hold after the first action, and so on.
+
+        No jump is taken.
 
         Returns:
             `RUNNING`, `SATISFIED` or `VIOLATED` of `hrlspec.spec`.

@@ -1,11 +1,15 @@
-"""Infinite tasks: from a formula to a deterministic automaton whose accepting transitions count.
+"""Infinite tasks: from a formula to an automaton whose accepting transitions count.
 
 A formula is read as conjunctions and disjunctions of parts. Each part is one of
 
 * **co-safe** (no ``G``): satisfied once and for all by some finite trace;
 * **safety** (no ``F``, ``U``, ``M``): violated by some finite trace, or never;
 * **recurrence** ``G F φ``, φ co-safe: again and again;
-* **response** ``G φ``, φ co-safe: what is owed is paid, again and again.
+* **response** ``G φ``, φ co-safe: what is owed is paid, again and again;
+* **persistence** ``F φ``, φ made of parts like the whole formula, such as ``F G a``: from some step on, φ holds.
+
+When that step has come is for the agent to say, by a jump: until then φ asks for nothing, after that it must hold, and
+each of its rounds meets the part. All else is deterministic.
 
 A transition accepts when a round of the conjunction is complete: each part that is not safety has been met since the
 last one, in the order of the text, at most one round a step. A part is met by the step with which it is satisfied, a
@@ -15,14 +19,16 @@ several parts that follow one another.
 
 from __future__ import annotations
 
+import abc
 import dataclasses
-from collections.abc import Collection, Iterable, Sequence
-from typing import Any, Protocol, TypeAlias
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Int, Int32
+from jaxtyping import Bool, Int
 
 from hrlspec.spec.ltl.automaton import Automaton
+from hrlspec.spec.ltl.merging import Jumps, merged
 from hrlspec.spec.ltl.syntax import Binary, Formula, Nary, Unary
 from hrlspec.spec.ltl.text import ltl_text
 from hrlspec.spec.ltl.translate import MAX_STATES, NOTHING_OWED, Progression, labels_of
@@ -32,19 +38,25 @@ _PartState: TypeAlias = tuple[Any, ...]
 """What a part remembers: remainders, places in rounds, states of its own parts; hashable."""
 
 
-class _Part(Protocol):
+class _Part(abc.ABC):
     """A part of a formula, as an automaton of its own."""
 
     @property
+    @abc.abstractmethod
     def start(self) -> _PartState:
         """Where it begins."""
 
+    @abc.abstractmethod
     def after(self, state: _PartState, label: int) -> tuple[_PartState, bool] | None:
         """Where it is after a label and whether that met it; ``None`` where it is violated."""
 
+    def jumps(self, state: _PartState) -> Iterator[_PartState]:
+        """Where it may be instead, before the next label."""
+        yield from ()
+
 
 @dataclasses.dataclass(frozen=True)
-class _Once:
+class _Once(_Part):
     """A co-safe part: met by the step that satisfies it and all after that; or again and again, by that step alone."""
 
     progression: Progression
@@ -63,7 +75,7 @@ class _Once:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Safety:
+class _Safety(_Part):
     """A safety part, by its negation, whose satisfaction violates it. No round waits for it."""
 
     progression: Progression
@@ -79,7 +91,7 @@ class _Safety:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Response:
+class _Response(_Part):
     """A response: met when all is paid that was owed when it was met before (Miyano and Hayashi's breakpoints)."""
 
     progression: Progression
@@ -100,12 +112,35 @@ class _Response:
         return (old, new), False
 
 
+@dataclasses.dataclass(frozen=True)
+class _Eventually(_Part):
+    """A persistence part: nothing is asked before the jump, the whole of what persists after it."""
+
+    what: _Round
+
+    @property
+    def start(self) -> _PartState:
+        return ()
+
+    def after(self, state: _PartState, label: int) -> tuple[_PartState, bool] | None:
+        return self.what.after(state, label) if state else (state, False)
+
+    def jumps(self, state: _PartState) -> Iterator[_PartState]:
+        if state:
+            yield from self.what.jumps(state)
+        else:
+            yield self.what.start
+
+
 def to_buchi(
     formula: Formula,
     propositions: Sequence[str],
     possible_labels: Iterable[Collection[str]] | None = None,
 ) -> Automaton:
-    """A deterministic automaton with accepting transitions; see the module for what is read and what counts.
+    """An automaton with accepting transitions; see the module for what is read and what counts.
+
+    Without persistence parts it is deterministic; with them it jumps into copies that wait for one of them less. It is
+    limit-deterministic, for nothing accepts before the last jump, unless a disjunction has an alternative without them.
 
     Args:
         formula: of linear temporal logic.
@@ -119,15 +154,40 @@ def to_buchi(
     """
     labels, distinct, columns = labels_of(formula, propositions, possible_labels)
     root = _round(Progression(distinct), formula)
-    successors, marks, rejecting = _merged(*_explore(root, len(distinct)))
-    return Automaton(labels, successors[:, columns], None, rejecting, marks[:, columns])
+    successors, marks, jumps, rejecting = merged(*_explore(root, len(distinct)))
+    return Automaton(labels, successors[:, columns], None, rejecting, marks[:, columns], jumps if any(jumps) else ())
 
 
 def _parts(operator: str, formula: Formula) -> list[Formula]:
     """What a conjunction or disjunction is made of, nested ones included."""
+    formula = _opened(formula)
     if isinstance(formula, Nary) and formula.operator == operator:
         return [part for each in formula.parts for part in _parts(operator, each)]
     return [formula]
+
+
+def _opened(formula: Formula) -> Formula:
+    """A formula that is none of the simple parts, with no negation or implication in front."""
+    return formula if _is_cosafe(formula) or _is_safety(formula) else _pushed(formula)
+
+
+def _pushed(formula: Formula) -> Formula:
+    match formula:
+        case Binary("->", left, right):
+            return Nary("|", (Unary("!", left), right))
+        case Binary("<->", left, right):
+            return Nary("&", (Binary("->", left, right), Binary("->", right, left)))
+        case Unary("!", Unary("!", inner)):
+            return _pushed(inner)
+        case Unary("!", Unary("F", inner)):
+            return Unary("G", _pushed(Unary("!", inner)))
+        case Unary("!", Unary("G", inner)):
+            return Unary("F", _pushed(Unary("!", inner)))
+        case Unary("!", Nary(operator, parts)):
+            return Nary("|" if operator == "&" else "&", tuple(Unary("!", part) for part in parts))
+        case Unary("!", Binary("->" | "<->", _, _) as inner):
+            return _pushed(Unary("!", _pushed(inner)))
+    return formula
 
 
 def _round(progression: Progression, formula: Formula) -> _Round:
@@ -148,11 +208,11 @@ def _part(progression: Progression, part: Formula) -> _Part:
             return _Once(progression, Unary("F", inner), again=True)
         case Unary("G", inner) if _is_cosafe(inner):
             return _Response(progression, inner)
-        case Unary("F", Unary("G", inner)) if _is_safety(inner):
-            raise SpecError(f"{ltl_text(part)} asks to stay for ever, which is not among what is learned")
+        case Unary("F", inner):
+            return _Eventually(_round(progression, inner))
     raise SpecError(
-        f"{ltl_text(part)} is none of what is read for ever: parts without G, parts without F and U, and G F φ or G φ "
-        "with a φ that has no G"
+        f"{ltl_text(part)} is none of what is read for ever: parts without G, parts without F and U, G F φ or G φ with "
+        "a φ that has no G, and F φ with a φ made of such parts"
     )
 
 
@@ -181,7 +241,7 @@ def _is_safety(formula: Formula) -> bool:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Round:
+class _Round(_Part):
     """A conjunction: met when all of its parts but safety have been met, one after the other."""
 
     parts: tuple[_Part, ...]
@@ -211,9 +271,15 @@ class _Round:
                 met[waited[at]] = first is not None and first[1]
         return (0 if complete else at, *places), complete
 
+    def jumps(self, state: _PartState) -> Iterator[_PartState]:
+        at, *places = state
+        for number, (part, place) in enumerate(zip(self.parts, places, strict=True)):
+            for target in part.jumps(place):
+                yield at, *places[:number], target, *places[number + 1 :]
+
 
 @dataclasses.dataclass(frozen=True)
-class _Either:
+class _Either(_Part):
     """A disjunction: met by each round of an alternative, violated when all of them are."""
 
     alternatives: tuple[_Round, ...]
@@ -231,59 +297,34 @@ class _Either:
             return None
         return tuple(step and step[0] for step in steps), any(step and step[1] for step in steps)
 
+    def jumps(self, state: _PartState) -> Iterator[_PartState]:
+        for number, (some, place) in enumerate(zip(self.alternatives, state, strict=True)):
+            for target in () if place is None else some.jumps(place):
+                yield *state[:number], target, *state[number + 1 :]
+
 
 def _comes_again(part: _Part) -> bool:
     return isinstance(part, _Once) and part.again
 
 
-def _explore(root: _Part, num_labels: int) -> tuple[Int[np.ndarray, "Q L"], Bool[np.ndarray, "Q L"]]:
-    """Successors and marks of all states that can be reached; state 1 is where the formula is violated."""
-    numbers, states = {root.start: 0}, [root.start, root.start]
-    successors, marks = [[1] * num_labels, [1] * num_labels], [[False] * num_labels, [False] * num_labels]
-    at = 0
-    while at < len(states):
-        for label in range(num_labels) if at != 1 else ():
-            found = root.after(states[at], label)
-            if found is None:
-                continue
-            after, marks[at][label] = found
-            if after not in numbers:
-                if len(states) == MAX_STATES:
-                    raise SpecError(f"the formula is too large: its automaton has more than {MAX_STATES:,} states")
-                numbers[after] = len(states)
-                states.append(after)
-                successors.append([1] * num_labels)
-                marks.append([False] * num_labels)
-            successors[at][label] = numbers[after]
-        at += 1
-    return np.array(successors), np.array(marks)
+def _explore(root: _Part, num_labels: int) -> tuple[Int[np.ndarray, "Q L"], Bool[np.ndarray, "Q L"], Jumps]:
+    """Successors, marks and jumps of all states that can be reached; state 1 is where the formula is violated."""
+    numbers, states = {root.start: 0}, [root.start, root.start]  # the second stands for the violated one
+    successors: list[list[int]] = []
+    marks: list[list[bool]] = []
+    jumps: list[tuple[int, ...]] = []
 
+    def number(state: _PartState) -> int:
+        if state not in numbers:
+            if len(states) == MAX_STATES:
+                raise SpecError(f"the formula is too large: its automaton has more than {MAX_STATES:,} states")
+            numbers[state] = len(states)
+            states.append(state)
+        return numbers[state]
 
-def _merged(
-    successors: Int[np.ndarray, "Q L"], marks: Bool[np.ndarray, "Q L"]
-) -> tuple[Int32[np.ndarray, "Q L"], Bool[np.ndarray, "Q L"], int | None]:
-    """Merges states that no continuation tells apart, numbered as they are reached; and which one is rejecting, if any.
-
-    Also rejecting is a state from which no accepting transition can be reached.
-    """
-    alive: Bool[np.ndarray, " Q"] = np.asarray(marks.any(1))
-    while not np.array_equal(wider := alive | alive[successors].any(1), alive):
-        alive = wider
-    marks = marks & alive[:, None]
-    kind = np.unique(np.column_stack([alive, marks]), axis=0, return_inverse=True)[1].reshape(-1)
-    while True:
-        finer = np.unique(np.column_stack([kind, kind[successors]]), axis=0, return_inverse=True)[1].reshape(-1)
-        if finer.max() == kind.max():
-            break
-        kind = finer
-    example = dict(zip(*np.unique(kind, return_index=True), strict=True))
-    number, order = {int(kind[0]): 0}, [int(kind[0])]
-    for group in order:  # Grows while it is read.
-        for after in kind[successors[example[group]]].tolist():
-            if after not in number:
-                number[after] = len(order)
-                order.append(after)
-    rows = [int(example[group]) for group in order]
-    dead = [place for place, row in enumerate(rows) if not alive[row]]
-    table = np.array([[number[group] for group in kind[successors[row]].tolist()] for row in rows], np.int32)
-    return table, marks[rows], dead[0] if dead else None
+    for at, state in enumerate(states):  # Grows while it is read.
+        found = [None if at == 1 else root.after(state, label) for label in range(num_labels)]
+        successors.append([1 if step is None else number(step[0]) for step in found])
+        marks.append([step is not None and step[1] for step in found])
+        jumps.append(() if at == 1 else tuple(map(number, root.jumps(state))))
+    return np.array(successors), np.array(marks), tuple(jumps)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import random
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pytest
@@ -66,22 +66,29 @@ def holds(formula: Formula, word: Word, loop: int) -> list[bool]:  # noqa: C901 
 
 
 def accepts(automaton: Automaton, word: Word, loop: int) -> bool:
-    """Whether transitions accept again and again on the word."""
+    """Whether with some choice of jumps transitions accept again and again on the word."""
     column = {label: number for number, label in enumerate(automaton.labels)}
     assert automaton.marks is not None
-    state = 0
-    for label in word[:loop]:
-        state = int(automaton.successors[state, column[label]])
-    seen: dict[int, int] = {}
-    marked: list[bool] = []
-    while state not in seen:
-        seen[state] = len(marked)
-        found = False
-        for label in word[loop:]:
-            found |= bool(automaton.marks[state, column[label]])
-            state = int(automaton.successors[state, column[label]])
-        marked.append(found)
-    return any(marked[seen[state] :])
+
+    def after(state: int, step: int) -> Iterator[tuple[tuple[int, int], bool]]:
+        """Where a state and a step of the word may lead, and whether that accepts."""
+        for target in automaton.jumps[state] if automaton.jumps else ():
+            yield (target, step), False
+        read = state, column[word[step]]
+        assert automaton.marks is not None
+        yield (int(automaton.successors[read]), step + 1 if step + 1 < len(word) else loop), bool(automaton.marks[read])
+
+    def reached(start: tuple[int, int]) -> set[tuple[int, int]]:
+        found, queue = {start}, [start]
+        for place in queue:
+            for target, _ in after(*place):
+                if target not in found:
+                    found.add(target)
+                    queue.append(target)
+        return found
+
+    accepting = ((place, to) for place in reached((0, 0)) for to, marked in after(*place) if marked)
+    return any(place in reached(to) for place, to in accepting)
 
 
 def random_cosafe(rng: random.Random, size: int) -> Formula:
@@ -116,9 +123,17 @@ def cases(count: int, seed: int = 0) -> list[tuple[Formula, Automaton]]:
 
 
 def random_round(rng: random.Random, depth: int) -> Formula:
-    """Conjunctions of disjunctions of conjunctions."""
+    """Conjunctions of disjunctions of conjunctions, some of them from some step on, implied, or denied."""
     if depth == 0:
         return random_part(rng)
+    kind = rng.randrange(8)
+    if kind == 0:
+        return Unary("F", random_round(rng, depth - 1))
+    if kind == 1:  # both sides can be denied
+        sides = [Unary(rng.choice("GF"), Unary(rng.choice("GF"), Proposition(rng.choice(NAMES)))) for _ in range(2)]
+        return rng.choice(
+            [Binary("->", *sides), Binary("<->", *sides), Unary("!", Nary(rng.choice("&|"), tuple(sides)))]
+        )
     return Nary(rng.choice("&&|"), tuple(random_round(rng, depth - 1) for _ in range(rng.randrange(2, 4))))
 
 
@@ -138,20 +153,17 @@ def test_a_word_is_accepted_when_the_formula_holds_on_it(count: int) -> None:
 
 
 @pytest.mark.parametrize("large", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_the_fields_recurrent_formulas_are_read(large: bool) -> None:
-    """All of them; those of staying are refused by name. SemLTL's take a second each."""
+def test_the_fields_infinite_formulas_are_read(large: bool) -> None:
+    """All of them; what asks to stay leaves a choice. SemLTL's take a second each."""
     kinds = {"recurrence": 0, "persistence": 0, "reactivity": 0}
     for row in (row for row in PEERS if row["kind"] == "infinite" and row["suite"].startswith("semltl") == large):
         formula = parse_ltl(row["formula"])
         kinds[row["class"]] += 1
-        if row["class"] == "recurrence":
-            automaton = to_buchi(formula, *possible_labels(row["suite"], formula))
-            assert automaton.marks is not None
-            assert automaton.marks.any()
-            assert automaton.num_states < 2000
-        else:
-            with pytest.raises(SpecError, match="asks to stay for ever"):
-                to_buchi(formula, *possible_labels(row["suite"], formula))
+        automaton = to_buchi(formula, *possible_labels(row["suite"], formula))
+        assert automaton.marks is not None
+        assert automaton.marks.any()
+        assert automaton.num_states < 2000
+        assert (len(automaton.jumps) > 0) == (row["class"] != "recurrence")
     everything = {"recurrence": 117, "persistence": 43, "reactivity": 7}
     of_semltl = {"recurrence": SEMLTL[0], "persistence": SEMLTL[1], "reactivity": 0}
     assert kinds == (of_semltl if large else {kind: everything[kind] - of_semltl[kind] for kind in kinds})
@@ -186,12 +198,70 @@ def test_rounds(text: str, trace: str, rounds: int) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("FG a", "F G a asks to stay for ever"),
-        ("GF a | FG b", "F G b asks to stay for ever"),
-        ("GF (a & G b)", "is none of what is read for ever"),
+        ("GF (a & G b)", "G F \\(a & G b\\) is none of what is read for ever"),
+        ("GF b | F (a & X GF b & GF c)", "X G F b is none"),
         ("GF z", "'z' is no proposition"),
     ],
 )
 def test_what_is_not_read(text: str, message: str) -> None:
     with pytest.raises(SpecError, match=message):
         to_buchi(parse_ltl(text), NAMES)
+
+
+ONE_AT_MOST = [frozenset(), *(frozenset(name) for name in "abc")]
+
+
+def test_one_jump_leads_into_a_copy_that_leaving_violates() -> None:
+    """As by hand: F G a waits whatever holds; after the jump each a is a round, and anything else the end."""
+    found = to_buchi(parse_ltl("FG a"), "abc", ONE_AT_MOST)
+    assert (found.jumps, found.rejecting) == (((1,), (), ()), 2)
+    assert found.successors.tolist() == [[0, 0, 0, 0], [2, 1, 2, 2], [2, 2, 2, 2]]
+    assert found.marks is not None
+    assert np.argwhere(found.marks).tolist() == [[1, 1]]
+
+
+@pytest.mark.parametrize(
+    ("text", "same"),
+    [
+        ("!GF a", "FG !a"),
+        ("!(FG a)", "GF !a"),
+        ("GF a -> GF b", "FG !a | GF b"),
+        ("!(GF a | FG b)", "FG !a & GF !b"),
+        ("!(GF a -> GF b)", "GF a & FG !b"),
+        ("FG a & F (b & F c)", "F (b & F c) & FG a"),
+    ],
+)
+def test_said_in_two_ways(text: str, same: str) -> None:
+    one, other = (to_buchi(parse_ltl(some), "abc", ONE_AT_MOST) for some in (text, same))
+    np.testing.assert_array_equal(one.successors, other.successors)
+    np.testing.assert_array_equal(one.marks, other.marks)
+    assert one.jumps == other.jumps
+
+
+def test_what_no_continuation_satisfies_is_rejecting() -> None:
+    """Who must stay in b or c and owes a cannot pay: after the jump b is the end, and no round."""
+    found = to_buchi(parse_ltl("G (b -> F a) & FG (b | c)"), "abc", ONE_AT_MOST)
+    (copy,) = found.jumps[0]
+    after = dict(zip("_abc", found.successors[copy].tolist(), strict=True))
+    assert after == {"_": found.rejecting, "a": found.rejecting, "b": found.rejecting, "c": copy}
+    assert found.marks is not None
+    assert np.flatnonzero(found.marks[copy]).tolist() == [3]
+
+
+def test_whatever_is_rejecting_accepts_nothing_and_all_else_something() -> None:
+    for _, automaton in cases(150):
+        dead = automaton.rejecting
+        assert automaton.marks is not None
+        table, marks = automaton.successors, automaton.marks
+        if dead is not None:
+            assert (table[dead] == dead).all()
+            assert not marks[dead].any()
+            assert not marks[table == dead].any()
+        for state in range(automaton.num_states):
+            found, queue = {state}, [state]
+            for one in queue:
+                for target in (*table[one].tolist(), *(automaton.jumps[one] if automaton.jumps else ())):
+                    if target not in found:
+                        found.add(target)
+                        queue.append(target)
+            assert (state == dead) == (not marks[sorted(found)].any())
