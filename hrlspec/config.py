@@ -202,6 +202,14 @@ class CurriculumConfig(Checked):
     are then practised about as many times more as there are tries, 1 / (1 - retry) at most."""
     joint: float = setting(0.0, least=0, most=1)
     """Share of sub-tasks that ask for propositions at once, in worlds where some can hold together."""
+    stay: float = setting(0.0, least=0, most=1, later=True)
+    """Share of tasks that end with staying where they are completed. The low level is told by p₊ lying ahead of
+    itself."""
+    hold_before_jump: int = setting(30, least=2, later=True)
+    """Steps in a row for which p₊ must hold first; whoever leaves tries again. An agent that is trained to stay commits
+    itself to what is to hold for ever after as many."""
+    longest_stay: int = setting(200, least=2, later=True)
+    """Most steps for which it must hold then; whoever leaves has failed. The number is random, the least is 2."""
     max_branching: int = setting(3, least=1)
     max_avoid: int = setting(3, least=0)
     tasks_per_level: int = setting(512, least=1)
@@ -277,6 +285,11 @@ class Config(Checked):
         if self.num_envs % self.blocks:
             raise ConfigError(
                 f"Config.blocks is {self.blocks}, expected a divisor of {self.num_envs}, the number of environments"
+            )
+        if self.curriculum.stay and not (self.network.roles and self.network.lookahead):
+            found = f"Config.curriculum.stay is {self.curriculum.stay:g}"
+            raise ConfigError(
+                f"{found}, which asks for a low level that sees ahead: roles and a lookahead of at least 1"
             )
         of_a_block = "" if self.blocks == 1 else f" of each of {self.blocks} blocks"
         rows = self.envs_per_block + self.copies_per_block

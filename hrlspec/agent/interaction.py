@@ -22,8 +22,10 @@ from hrlspec.agent.experience import HighDecision, LowDecision, Outcome, View, u
 from hrlspec.agent.groups import in_groups, take
 from hrlspec.agent.low_level import Params, TaskBook
 from hrlspec.agent.networks.controller import Instruction
+from hrlspec.agent.networks.tree import with_stays
 from hrlspec.agent.shield import shielded_action
 from hrlspec.spec import RUNNING, SATISFIED, TaskState, TaskTree, advance, initial, open_edges
+from hrlspec.spec.monitor import holding
 from hrlspec.tasks import rewards
 from hrlspec.tasks.rewards import RewardMachine
 
@@ -106,7 +108,8 @@ def decide(
         tree, instructions = take((book.tree, book.instructions), task)
         choice = agent.high.choose(agent.low, params, view, tree, state, instructions)
         edge, log_prob = jax.vmap(Categorical(noise.shape[-1]).sample)(choice.logits, noise)
-        ahead, leaf = take((choice.ahead, choice.leaf), jnp.arange(edge.shape[0], dtype=jnp.int32), edge)
+        told = jax.vmap(with_stays)(tree, choice.ahead)
+        ahead, leaf = take((told, choice.leaf), jnp.arange(edge.shape[0], dtype=jnp.int32), edge)
         return HighDecision(jnp.ones(edge.shape, bool), edge, ahead, log_prob, choice.value, choice.advice, leaf)
 
     before, task = worker.decision, worker.task
@@ -217,8 +220,16 @@ def _progress(
         state = jax.vmap(advance)(task_of(book, worker.task), worker.task_state, labels, edge)
         lost = jnp.take_along_axis(state.blocked, edge[:, None], 1)[:, 0]
         return worker.task, state, state.node != worker.task_state.node, lost, jnp.zeros_like(lost)
-    task, accepted = jax.vmap(book.automata.advance)(worker.task, labels, edge)
+    tree = task_of(book, worker.task)
+    held = jax.vmap(holding)(tree, worker.task_state, labels)
+    jumping = edge
+    if held is not None and tree.hold is not None:  # where it has not held for long enough there is no jump yet
+        long_enough = jnp.take_along_axis(held >= tree.hold, edge[:, None], 1)[:, 0]
+        jumping = jnp.where(long_enough, edge, TaskTree.NO_NODE)
+    task, accepted = jax.vmap(book.automata.advance)(worker.task, labels, jumping)
     state = dataclasses.replace(jax.vmap(initial)(task_of(book, task)), status=book.automata.status[task])
+    if held is not None:
+        state = dataclasses.replace(state, held=jnp.where((task == worker.task)[:, None], held, 0))
     return task, state, (task != worker.task) | accepted, jnp.zeros_like(accepted), accepted
 
 

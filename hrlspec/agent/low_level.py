@@ -94,9 +94,15 @@ class LowLevel:
     def prepare(self, params: Params, tasks: TaskTree | Automata) -> TaskBook:
         """Prepares tasks for acting: trees (leading axis M), or automata, whose states are the M rows then."""
         automata = tasks if isinstance(tasks, Automata) else None
-        trees = tasks.trees if isinstance(tasks, Automata) else tasks
+        trees = self._staying(tasks.trees) if isinstance(tasks, Automata) else tasks
         instructions = jax.vmap(self.instruct, in_axes=(None, 0))(params, trees)
         return TaskBook(tree=trees, instructions=instructions, forks=jax.vmap(forks)(trees), automata=automata)
+
+    def _staying(self, trees: TaskTree) -> TaskTree:
+        """How long p₊ holds before a jump after which it must; nothing of that for who was not trained to stay."""
+        config = self.config.curriculum
+        hold = None if trees.hold is None or not config.stay else jnp.where(trees.hold > 1, config.hold_before_jump, 1)
+        return dataclasses.replace(trees, hold=hold)
 
     def instructions_at(
         self,

@@ -109,9 +109,10 @@ def copies(
     slot = jnp.minimum(rollout.episode, new.tree.parent.shape[1] - 1)
     high, low = _estimates(agent, params, rollout, new, slot)
     shape, nothing = slot.shape, jnp.zeros_like(new.reward)
+    hold = None if book.tree.hold is None else jnp.ones(new.tree.parent.shape, jnp.int32)
     blocked = jnp.zeros((*shape, new.tree.num_nodes), bool)
     return Experience(
-        trees=new.tree,
+        trees=dataclasses.replace(new.tree, hold=hold),
         slot=slot,
         view=rollout.view,
         state=TaskState(node=new.node, blocked=blocked, status=jnp.full(shape, RUNNING, jnp.int32)),
@@ -177,12 +178,15 @@ def _estimates(
 def _record(agent: Agent, book: TaskBook, rollout: Step) -> Record:
     """What relabelling needs, ``[E, T]``."""
     edge = rollout.outcome.node
+    at = rollout.task, edge
+    # What held for a while was met long before it was completed.
+    kept = True if book.tree.hold is None else book.tree.hold[at] == 1
     record = Record(
         slot=rollout.episode,
         labels=rollout.outcome.labels,
-        edge_taken=rollout.outcome.edge_taken,
-        reach=book.tree.reach[rollout.task, edge],
-        avoid=book.tree.avoid[rollout.task, edge],
+        edge_taken=rollout.outcome.edge_taken & kept,
+        reach=book.tree.reach[at],
+        avoid=book.tree.avoid[at],
     )
     return jax.vmap(visits)(record) if agent.config.relabel.hindsight else record
 

@@ -147,6 +147,11 @@ def collect(
     return collector, dataclasses.replace(steps, bootstrap=bootstrap, high=high)
 
 
+def _to_learn_from(state: TaskState) -> TaskState:
+    """Without what neither level sees: for how long something has held."""
+    return dataclasses.replace(state, held=None)
+
+
 def _with_values(
     setting: Setting, steps: Step, end: Worker, worth: Float32[Array, " E"]
 ) -> tuple[HighDecision, Float32[Array, " E"]]:
@@ -156,7 +161,7 @@ def _with_values(
     """
     agent, book = setting.agent, setting.book
     rows = jax.tree.map(flat, (steps.view, steps.task, steps.state))
-    last = (end.view, end.task, end.task_state)
+    last = (end.view, end.task, _to_learn_from(end.task_state))
     settled, settled_last = (
         agent.high.settled(task_of(book, task), state, book.forks[task]) != TaskTree.NO_NODE
         for _, task, state in (rows, last)
@@ -235,7 +240,7 @@ def _step(setting: Setting, carry: tuple[Collector, _Reach], chance: _Chance) ->
         level=collector.level,
         episode=collector.started,
         since=collector.since,
-        state=before.task_state,
+        state=_to_learn_from(before.task_state),
         high=before.decision,
         low=low,
         outcome=outcome,

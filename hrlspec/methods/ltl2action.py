@@ -19,7 +19,7 @@ from hrlspec.agent.high_level import Choice, HighLevel
 from hrlspec.agent.low_level import LowLevel, Params
 from hrlspec.agent.method import Method
 from hrlspec.agent.networks.controller import Instruction, Sees
-from hrlspec.config import Checked, Config, NetworkConfig
+from hrlspec.config import Checked, Config, ConfigError, NetworkConfig, evolve
 from hrlspec.spec import TaskState, TaskTree, open_edges
 
 
@@ -31,6 +31,11 @@ class NoChoice(Checked, HighLevel):
         """Nothing is learned."""
         del key, low, view, tree
         return {}
+
+    def check(self, config: Config) -> None:
+        """Refuses to be trained to stay: the policy is told of no single sub-task."""
+        if config.curriculum.stay:
+            raise ConfigError(f"Config.curriculum.stay is {config.curriculum.stay:g}, which LTL2Action cannot be told")
 
     def settled(self, tree: TaskTree, state: TaskState, forks: Bool[Array, "B N"]) -> Int32[Array, " B"]:
         """The root, which is no edge, wherever the task stands."""
@@ -60,7 +65,7 @@ class LTL2Action(Method):
     sees: ClassVar[Sees] = "whole task"
 
     def configure(self, config: Config) -> Config:
-        """Without a sub-task there are no roles to encode the observation by, and no avoid set for the shield."""
+        """Without a sub-task there are no roles to encode the observation by, no avoid set for the shield, no stays."""
         network = dataclasses.replace(
             config.network,
             # Images are not seen by role, which is what makes convolutions superfluous.
@@ -75,7 +80,7 @@ class LTL2Action(Method):
             symmetric=False,
         )
         shield = dataclasses.replace(config.shield, enabled=False)
-        return dataclasses.replace(config, network=network, shield=shield)
+        return dataclasses.replace(evolve(config, {"curriculum.stay": 0.0}), network=network, shield=shield)
 
 
 LTL2ACTION = LTL2Action()

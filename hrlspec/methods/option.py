@@ -26,7 +26,7 @@ from hrlspec.agent.high_level import Choice, HighLevel, Rewards
 from hrlspec.agent.low_level import LowLevel, Params, TaskBook
 from hrlspec.agent.method import Method
 from hrlspec.agent.networks.controller import Instruction, Sees
-from hrlspec.config import Checked, Config, setting
+from hrlspec.config import Checked, Config, evolve, setting
 from hrlspec.spec import TaskState, TaskTree, open_edges
 
 _LEAST = 1e-9
@@ -199,8 +199,8 @@ class Option(Method):
 
     def configure(self, config: Config) -> Config:
         """Nothing of other sub-tasks, before or after."""
-        return dataclasses.replace(
-            config, network=dataclasses.replace(config.network, lookahead=0, names=False, memory=0)
+        return evolve(
+            config, {"network.lookahead": 0, "network.names": False, "network.memory": 0, "curriculum.stay": 0.0}
         )
 
 

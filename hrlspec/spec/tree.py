@@ -29,6 +29,8 @@ class TaskTree:
         accepting: bool ``[N]``, arriving here satisfies the task. Accepting nodes have no children.
         valid: bool ``[N]``, false for padding.
         depth: int32 ``[N]``, edges from the root, 0 for the root and for padding.
+        hold: int32 ``[N]``, for how many steps in a row p₊ must hold to take the edge; ``None`` if for one, everywhere.
+            Where for more, and the edge before reached p₊, too, the edge is blocked as soon as p₊ does not hold.
     """
 
     NO_NODE: ClassVar[int] = -1
@@ -40,6 +42,7 @@ class TaskTree:
     accepting: Bool[Array, "*lead N"]
     valid: Bool[Array, "*lead N"]
     depth: Int32[Array, "*lead N"]
+    hold: Int32[Array, "*lead N"] | None = None
 
     @property
     def num_nodes(self) -> int:

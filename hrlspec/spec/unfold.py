@@ -4,6 +4,7 @@ In a state q that is a tree rooted at q: useful simple paths to acceptance (of a
 accepting transition), shortest first. A move is useful unless whatever is accepted after it would have been accepted
 without it. A sub-task's p₊ is the least that must hold for the automaton to move, its p₋ what takes the way on from it.
 A move may begin with a jump: the agent that chose it jumps where p₊ comes to hold, so that this is read after the jump.
+Where after a move something must hold at every step, p₊ is to be held.
 
 Axes: **Q** states, **L** labels, **N** tree nodes, **P** atomic propositions.
 """
@@ -11,6 +12,7 @@ Axes: **Q** states, **L** labels, **N** tree nodes, **P** atomic propositions.
 from __future__ import annotations
 
 import collections
+import dataclasses
 import heapq
 import itertools
 from collections.abc import Iterator, Sequence
@@ -46,7 +48,8 @@ class Unfolded(NamedTuple):
     """What the agent is shown in each state of an automaton.
 
     Attributes:
-        trees: leading axis Q; numpy leaves. In a state without moves the tree is a root without children.
+        trees: leading axis Q; numpy leaves. In a state without moves the tree is a root without children. Of an edge
+            at the root whose p₊ is to be held for ever ``hold`` is 2, else 1.
         cut: bool ``[Q]``, paths were left out because N nodes are too few.
         silent: bool ``[Q]``, a way on is left out because it begins where nothing holds, which no sub-task can ask for.
         origin: int32 ``[Q, N]``, of each edge at the root the state that reads what meets it: q, unless it begins with
@@ -70,6 +73,7 @@ def unfold(automaton: Automaton, propositions: Sequence[str], max_nodes: int) ->
     moves = _Moves(automaton if automaton.marks is None else _until_accepting(automaton, automaton.marks))
     rows, cut = [], []
     origin = np.repeat(np.arange(automaton.num_states, dtype=np.int32)[:, None], max_nodes, 1)
+    hold = np.ones_like(origin)
     for state in range(automaton.num_states):
         nodes, complete = _paths(moves, state, max_nodes)
         rows.append(_tree(nodes, propositions, max_nodes))
@@ -77,9 +81,19 @@ def unfold(automaton: Automaton, propositions: Sequence[str], max_nodes: int) ->
         for number, path in enumerate(nodes):
             if len(path) == 1:
                 origin[state, number] = path[0].origin
-    trees: TaskTree = jax.tree.map(lambda *x: np.stack(x), *rows)
+                hold[state, number] += _stays(automaton, path[0])
+    trees: TaskTree = dataclasses.replace(jax.tree.map(lambda *x: np.stack(x), *rows), hold=hold)
     silent = np.array([moves.silent(state) for state in range(automaton.num_states)])
     return Unfolded(trees, np.array(cut), silent & ~_rests(automaton), origin)
+
+
+def _stays(automaton: Automaton, move: Move) -> bool:
+    """Whether after a move its p₊ may hold for ever, and nothing may not."""
+    if automaton.marks is None or frozenset() not in automaton.labels:
+        return False
+    here, nothing = (automaton.labels.index(label) for label in (move.reach, frozenset[str]()))
+    after = automaton.successors[automaton.successors[move.origin, here]]
+    return bool(after[nothing] == automaton.rejecting != after[here])
 
 
 def _rests(automaton: Automaton) -> Bool[np.ndarray, " Q"]:

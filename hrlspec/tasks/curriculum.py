@@ -5,6 +5,7 @@ Axes: **L** levels, **M** tasks per level, **S** tasks drawn, **J** sets of prop
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -100,4 +101,25 @@ def draw_bank(
                 )
             )
         levels += parts
-    return jax.tree.map(lambda *x: np.concatenate(x), *levels)
+    bank: TaskTree = jax.tree.map(lambda *x: np.concatenate(x), *levels)
+    return _with_stays(rng, config, bank) if config.stay else bank
+
+
+def _with_stays(rng: np.random.Generator, config: CurriculumConfig, bank: TaskTree) -> TaskTree:
+    """The same tasks, a share ``stay`` of which ends with staying where they are completed.
+
+    First p₊ must hold for ``hold_before_jump`` steps in a row, with as many tries as it takes; then for a random number
+    of steps more, and whoever leaves has failed.
+    """
+    tree: TaskTree = jax.tree.map(np.array, bank)
+    hold = np.ones(tree.parent.shape, np.int32)
+    fits = tree.valid.sum(-1) + tree.accepting.sum(-1) <= tree.num_nodes
+    for row in np.flatnonzero(fits & (rng.random(len(fits)) < config.stay)).tolist():
+        ends = np.flatnonzero(tree.accepting[row])
+        more = tree.valid[row].sum() + np.arange(len(ends))
+        tree.parent[row, more], tree.valid[row, more] = ends, True
+        tree.depth[row, more] = tree.depth[row, ends] + 1
+        tree.reach[row, more], tree.avoid[row, more] = tree.reach[row, ends], ~tree.reach[row, ends]
+        tree.accepting[row, ends], tree.accepting[row, more] = False, True
+        hold[row, ends], hold[row, more] = config.hold_before_jump, rng.integers(2, config.longest_stay + 1)
+    return dataclasses.replace(tree, hold=hold)  # type: ignore[arg-type]

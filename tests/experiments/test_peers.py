@@ -98,12 +98,12 @@ def test_rows_of_means_are_over_the_same_formulas() -> None:
     assert table["`!(purple \\| yellow) U (red & F green)`"][theirs] == "0.943 / 156.8 / 0.031"
 
 
-def test_page_says_which_formulas_are_left_out() -> None:
+def test_page_says_which_formulas_are_elsewhere_or_left_out() -> None:
     suites = {suite: comparison for comparison in COMPARISONS.values() for suite in comparison.suites if "/" in suite}
     scores = {Evaluation(world.runs(1)[0], suite): scored(suite, 0.5, None) for suite, world in suites.items()}
     said = [line for line in page({}, scores) if line.startswith("Formulas: ")]
-    left_out = [suite for suite, line in zip(suites, said, strict=True) if "ask to stay, are left out" in line]
-    assert left_out == ["jaxolotl/zone_nm_infinite", "deepltl/zone_infinite", "jaxolotl_blue/zone_nm_infinite"]
+    elsewhere = [suite for suite, line in zip(suites, said, strict=True) if "ask to stay are" in line]
+    assert elsewhere == ["jaxolotl/zone_nm_infinite", "deepltl/zone_infinite", "jaxolotl_blue/zone_nm_infinite"]
 
 
 def test_page_of_chains() -> None:

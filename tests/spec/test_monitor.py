@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from collections.abc import Iterator
 from functools import partial
@@ -219,6 +220,28 @@ def _walk(text: str, trace: list[str], assigned: int = TaskTree.NO_NODE) -> tupl
 )
 def test_rules_by_example(text: str, trace: list[str], assigned: int, node: int, status: int) -> None:
     assert _walk(text, trace, assigned) == (node, status)
+
+
+@pytest.mark.parametrize(
+    ("trace", "node", "status"),
+    [
+        (["a", "a"], 0, RUNNING),
+        (["a", "a", "b", "a", "a"], 0, RUNNING),  # begun anew
+        (["a", "a", "a"], 1, RUNNING),
+        (["a", "a", "a", "a", ""], 1, VIOLATED),  # once it has held for long enough there is no second try
+        (["a", "a", "a", "", "a", "a"], 1, VIOLATED),
+        (["b", "a", "a", "a", "ab", "a"], 2, SATISFIED),
+        (["a", "a", "c"], 0, VIOLATED),  # avoiding comes first
+    ],
+)
+def test_holding(trace: list[str], node: int, status: int) -> None:
+    """a for three steps in a row, clear of c; then for two more."""
+    tree = compile_task(parse("achieve a ensuring not c; achieve a"), NAMES, 4)
+    tree = dataclasses.replace(tree, hold=jnp.array([1, 3, 2, 1], jnp.int32))
+    state = initial(tree)
+    for now in trace:
+        state = advance(tree, state, jnp.array([name in now for name in NAMES]), TaskTree.NO_NODE)
+    assert (int(state.node), int(state.status)) == (node, status)
 
 
 @pytest.mark.filterwarnings("ignore::hrlspec.spec.SpecWarning")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -83,3 +85,32 @@ def test_bank_avoids_reserved_tasks_and_repeats_itself() -> None:
     assert np.isin(task_hashes(bank), reserved).any()
     held = curriculum.draw_bank(np.random.default_rng(1), CONFIG, 5, reserved)
     assert not np.isin(task_hashes(held), reserved).any()
+
+
+def test_a_share_of_tasks_ends_with_staying() -> None:
+    """Their leaves are followed by another that reaches the same and avoids all else; other tasks are as they were."""
+    stays = dataclasses.replace(CONFIG, stay=0.5, hold_before_jump=7, longest_stay=9, tree_share=0.5, max_nodes=12)
+    none = np.zeros(0, np.uint32)
+    with_stays = curriculum.draw_bank(np.random.default_rng(0), stays, 5, none)
+    without = curriculum.draw_bank(np.random.default_rng(0), dataclasses.replace(stays, stay=0.0), 5, none)
+    assert without.hold is None
+    assert with_stays.hold is not None
+    changed = (with_stays.hold > 1).any(-1)
+    assert 0.3 < changed.mean() < 0.6
+    longest = set()
+    for row in range(len(changed)):
+        new, old = (jax.tree.map(lambda x, row=row: x[row], bank) for bank in (with_stays, without))
+        for name in ("parent", "reach", "avoid", "valid", "depth"):
+            kept = getattr(new, name)[old.valid], getattr(old, name)[old.valid]
+            np.testing.assert_array_equal(*kept)
+        if not changed[row]:
+            np.testing.assert_array_equal(new.accepting, old.accepting)
+            continue
+        ends = np.flatnonzero(new.accepting)
+        np.testing.assert_array_equal(np.sort(new.parent[ends]), np.flatnonzero(old.accepting))
+        assert (new.hold[new.parent[ends]] == 7).all()
+        np.testing.assert_array_equal(new.reach[ends], new.reach[new.parent[ends]])
+        np.testing.assert_array_equal(new.avoid[ends], ~new.reach[ends])
+        assert (new.hold > 1).sum() == 2 * len(ends)
+        longest |= set(new.hold[ends].tolist())
+    assert longest == {2, 3, 4, 5, 6, 7, 8, 9}

@@ -20,7 +20,7 @@ from envs_jax.arrays import Array
 from hrlspec.agent.networks.encoder import MLP, Encoder, Planes, Shared
 from hrlspec.agent.networks.exclusions import Exclusions
 from hrlspec.agent.networks.symmetry import reflect, turn
-from hrlspec.agent.networks.tree import TaskEmbedding, lookahead, lookback
+from hrlspec.agent.networks.tree import TaskEmbedding, lookahead, lookback, with_stays
 from hrlspec.config import NetworkConfig
 from hrlspec.spec import TaskTree, forbidden, subtask_avoid
 
@@ -116,7 +116,7 @@ class Controller(nn.Module):
             instruction = dataclasses.replace(
                 instruction, ahead=jnp.zeros_like(instruction.ahead), future=jnp.zeros_like(instruction.future)
             )
-        return instruction
+        return dataclasses.replace(instruction, ahead=with_stays(tree, instruction.ahead))
 
     def remaining(
         self, messages: Float32[Array, "*lead N F"], edges: Bool[Array, "*lead N"]

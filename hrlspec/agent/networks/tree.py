@@ -52,6 +52,16 @@ def lookahead(tree: TaskTree, depth: int) -> Bool[Array, "N D P"]:
     return jnp.stack(ahead, 1) if ahead else jnp.zeros((tree.num_nodes, 0, tree.num_propositions), bool)
 
 
+def with_stays(tree: TaskTree, ahead: Float32[Array, "N D P"]) -> Float32[Array, "N D P"]:
+    """What lies ahead of each edge, ``[N, D, P]``: where p₊ must hold for a while that is p₊ itself.
+
+    No other sub-task has its own goal before it, so that this says what is meant.
+    """
+    if tree.hold is None:
+        return ahead
+    return jnp.where((tree.hold > 1)[:, None, None], tree.reach[:, None].astype(ahead.dtype), ahead)
+
+
 def forks(tree: TaskTree) -> Bool[Array, " N"]:
     """Whether more than one way leads on from a node or from one below it, bool ``[N]``."""
     several = jnp.zeros(tree.num_nodes, jnp.int32).at[tree.parent].add(tree.edges.astype(jnp.int32)) > 1

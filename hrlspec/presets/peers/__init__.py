@@ -16,7 +16,7 @@ def peer_suites() -> tuple[str, ...]:
 
 def go_on_for_ever(name: str) -> bool:
     """Whether the formulas of a published suite are meant for ever, and not to be satisfied by an episode's end."""
-    return name.endswith("_infinite")
+    return name.endswith(("_infinite", "_stay"))
 
 
 def peer_formulas(name: str) -> str:
