@@ -46,9 +46,6 @@ NEW = {
     "config.network.chart": [],
     "config.network.waves": 0,
     "config.curriculum.retry": 0.0,
-    "config.curriculum.stay": 0.0,
-    "config.curriculum.longest_stay": 200,
-    "config.curriculum.hold_before_jump": 30,
     "config.network.forbidden": False,
     "config.network.exclusions": False,
     "config.network.near": 0.0,
@@ -77,7 +74,13 @@ def dotted(settings: Any, prefix: str = "") -> dict[str, Any]:
     }
 
 
-ADDED = {"config.blocks": 1, "evaluation.final": "test"}
+ADDED = {
+    "config.blocks": 1,
+    "evaluation.final": "test",
+    "config.curriculum.stay": 0.0,
+    "config.curriculum.longest_stay": 200,
+    "config.curriculum.hold_before_jump": 30,
+}
 ADDED_TO_PLANNERS = {
     f"{_PLANNER}.values_paths": False,
     f"{_PLANNER}.inverse_temperature": 400.0,

@@ -27,6 +27,7 @@ from experiments.paper.claims import (
 )
 from experiments.paper.panels import (
     BUDGETS,
+    FIRST_TRIAL_SEED,
     NUM_SEEDS,
     PANELS,
     TRAJECTORY_TASKS,
@@ -69,8 +70,9 @@ def _first(run: Run) -> Experiment:
 
 
 def experiment_now(run: Run) -> Experiment:
-    """What a run's flags mean; they are parsed once for all seeds."""
-    return dataclasses.replace(_first(dataclasses.replace(run, seed=0)), seed=run.seed)
+    """What a run's flags mean; they are parsed once for all seeds of a split."""
+    first = 0 if run.split == "test" else FIRST_TRIAL_SEED
+    return dataclasses.replace(_first(dataclasses.replace(run, seed=first)), seed=run.seed)
 
 
 def test_there_are_nine_panels_of_the_paper_and_one_of_techniques() -> None:
