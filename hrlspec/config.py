@@ -203,11 +203,11 @@ class CurriculumConfig(Checked):
     joint: float = setting(0.0, least=0, most=1)
     """Share of sub-tasks that ask for propositions at once, in worlds where some can hold together."""
     stay: float = setting(0.0, least=0, most=1, later=True)
-    """Share of tasks that end with staying where they are completed. The low level is told by p₊ lying ahead of
+    """Share of tasks that end with staying where they are completed. The low level is told by the goal lying ahead of
     itself."""
     hold_before_jump: int = setting(30, least=2, later=True)
-    """Steps in a row for which p₊ must hold first; whoever leaves tries again. An agent that is trained to stay commits
-    itself to what is to hold for ever after as many."""
+    """Steps in a row for which the goal must hold first; whoever leaves tries again. An agent that is trained to stay
+    commits itself to what is to hold for ever after as many."""
     longest_stay: int = setting(200, least=2, later=True)
     """Most steps for which it must hold then; whoever leaves has failed. The number is random, the least is 2."""
     max_branching: int = setting(3, least=1)
