@@ -30,7 +30,8 @@ from envs_jax.arrays import Array
 from envs_jax.base import Layout
 from hrlspec.agent.agent import Agent
 from hrlspec.agent.experience import View, view_of
-from hrlspec.config import evolve
+from hrlspec.agent.method import Method
+from hrlspec.config import Config, evolve
 from hrlspec.evaluation import Suite
 from hrlspec.evaluation.first_choice import first_choice_evaluation
 from hrlspec.methods import ImplicitPlanner
@@ -62,6 +63,8 @@ class Flags:
     minibatch: int = 256
     learning_rate: float = 1e-3
     """At first; it falls to zero by a cosine."""
+    width: int = 1
+    """How many times as wide as the recipe's all layers are."""
     out: Path | None = None
     """Where the JSON goes besides standard output."""
 
@@ -130,7 +133,7 @@ def train(flags: Flags) -> Iterator[dict[str, Any]]:
     """Trains, and yields after each draw what was seen by then and how many first choices for validation are right."""
     world = preset(flags.env)
     config, method = world.settings("ours", flags.recipe, flags.reward_set)
-    agent = Agent(world.make(), config, evolve(method, {"high.network.advice": 0.0, "high.values_paths": False}))
+    agent = Agent(world.make(), *_as_wide(flags.width, config, method))
     suite, machine = world.suite("dag_validation"), world.rewards(flags.reward_set)
     evaluate = first_choice_evaluation(agent.env, suite, machine, seed=1, greedy=True)
     key = jax.random.key(flags.seed)
@@ -156,8 +159,27 @@ def train(flags: Flags) -> Iterator[dict[str, Any]]:
             params["high"], state, value = descend(params["high"], state, batch)
             losses.append(value)
         seen, drawn = seen + len(losses) * flags.minibatch, drawn + pairs
-        result = evaluate(jax.random.fold_in(key, number), agent, params, machine)
-        yield {"samples": seen, "drawn": drawn, "loss": float(np.mean(losses)), **result.to_json()}
+        now = jax.random.fold_in(key, number)
+        result, right = evaluate(now, agent, params, machine), evaluate.right(now, agent, params, machine)
+        margins = _by_margin(right, evaluate.cases.margin)
+        yield {"samples": seen, "drawn": drawn, "loss": float(np.mean(losses)), **result.to_json(), "margins": margins}
+
+
+def _as_wide(width: int, config: Config, method: Method) -> tuple[Config, Method]:
+    """The settings of networks so many times as wide, and a planner that nobody advises."""
+    network, own = config.network, method.high.network  # type: ignore[attr-defined]
+    wide = {"features": width * own.features, "hidden": width * own.hidden, "advice": 0.0}
+    wide["policy"] = tuple(width * size for size in own.policy)
+    encoder = {"latent": width * network.latent, "encoder_mlp": tuple(width * size for size in network.encoder_mlp)}
+    changed = evolve(config, {f"network.{name}": value for name, value in encoder.items()})
+    planner = {"high.values_paths": False} | {f"high.network.{name}": value for name, value in wide.items()}
+    return changed, evolve(method, planner)
+
+
+def _by_margin(right: Bool[np.ndarray, " B"], margin: Float32[np.ndarray, " B"]) -> list[tuple[float, int, float]]:
+    """For each whole margin, from 5 on together: itself, how many cases have it, and how many of them are right."""
+    whole = np.minimum(np.round(margin), 5)
+    return [(float(m), int((whole == m).sum()), float(right[whole == m].mean())) for m in np.unique(whole)]
 
 
 def main() -> None:
@@ -172,6 +194,7 @@ def main() -> None:
     shared = {key: curve[-1][key] for key in ("suite", "by", "episodes", "excluded", "chance")}
     columns = ("samples", "drawn", "loss", "first_choice", "first_choice_interval")
     settings = {**dataclasses.asdict(flags), "out": None}
+    shared["margins"] = curve[-1]["margins"]
     report = {"flags": settings, **shared, "curve": {name: [row[name] for row in curve] for name in columns}}
     text = json.dumps({**report, **circumstances(command=False)}, indent=2)
     print(text)

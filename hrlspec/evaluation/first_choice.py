@@ -50,6 +50,8 @@ class FirstChoices:
         task: int ``[B]``, rows of the suite.
         layouts: a layout pytree, numpy leaves with leading axis B.
         best: bool ``[B, N]``, the first edges that are as good as the best.
+        margin: float ``[B]``, how much more the best is worth than the best of those that are not as good: steps, or
+            return.
         by: what makes them so.
         chance: expected rate of an agent that draws its first edge uniformly.
         excluded: pairs of task and layout that were left out because the choice matters too little.
@@ -59,6 +61,7 @@ class FirstChoices:
     task: Int[np.ndarray, " B"]
     layouts: Layout
     best: Bool[np.ndarray, "B N"]
+    margin: Float32[np.ndarray, " B"]
     by: By
     chance: float
     excluded: int
@@ -118,10 +121,7 @@ class FirstChoiceEvaluation:
     def __call__(self, key: Key[Array, ""], agent: Agent, params: Params, machine: RewardMachine) -> FirstChoiceResult:
         """Scores an agent whose high level assigns sub-tasks. The key is consumed."""
         cases = self.cases
-        edge = np.asarray(
-            _first_edges(agent, self.greedy, key, params, machine, cases.suite.trees, cases.task, cases.layouts)
-        )
-        right = cases.best[np.arange(len(cases)), edge]
+        right = self.right(key, agent, params, machine)
         return FirstChoiceResult(
             suite=cases.suite.name,
             greedy=self.greedy,
@@ -131,6 +131,16 @@ class FirstChoiceEvaluation:
             rate=rate_interval(right, tasks=cases.task),
             chance=cases.chance,
         )
+
+    def right(
+        self, key: Key[Array, ""], agent: Agent, params: Params, machine: RewardMachine
+    ) -> Bool[np.ndarray, " B"]:
+        """In which cases the agent assigns a best one, bool ``[B]``. The key is consumed."""
+        cases = self.cases
+        edge = np.asarray(
+            _first_edges(agent, self.greedy, key, params, machine, cases.suite.trees, cases.task, cases.layouts)
+        )
+        return np.asarray(cases.best[np.arange(len(cases)), edge])
 
 
 def first_choice_evaluation(
@@ -158,7 +168,7 @@ def first_choice_evaluation(
     """
     layouts = draw_layouts(env, suite, layouts_per_task, seed=seed)
     worth, by = _branch_values(env, layouts, machine)
-    task, kept, best, chances, excluded = [], [], [], [], 0
+    task, kept, best, margin, chances, excluded = [], [], [], [], [], 0
     for row in range(len(suite)):
         rows = np.arange(row * layouts_per_task, (row + 1) * layouts_per_task)
         tree = task_of(suite, row)
@@ -171,6 +181,7 @@ def first_choice_evaluation(
         task += [row] * int(matters.sum())
         kept += rows[matters].tolist()
         chances += good[matters].mean(1).tolist()
+        margin.append((values.max(1) - np.where(good, -np.inf, values).max(1))[matters])
         of_nodes = np.zeros((len(rows), tree.num_nodes), bool)
         of_nodes[:, children] = good
         best.append(of_nodes[matters])
@@ -181,6 +192,7 @@ def first_choice_evaluation(
         task=np.array(task),
         layouts=jax.tree.map(lambda x: x[np.array(kept)], layouts),
         best=np.concatenate(best),
+        margin=np.concatenate(margin).astype(np.float32),
         by=by,
         chance=float(np.mean(chances)),
         excluded=excluded,
