@@ -90,7 +90,8 @@ def test_there_are_nine_panels_of_the_paper_and_one_of_techniques() -> None:
 
 def test_every_run_is_one_that_can_be_made_and_has_a_name_of_its_own() -> None:
     runs = {run for panel in (PANELS | TUNING).values() for run in panel.runs(1, None)}
-    assert len({run.name for run in runs}) == len(runs) == 56 + 54
+    trials = sum(len(rates) for tried in TRIED.values() for rates in tried.values())
+    assert len({run.name for run in runs}) == len(runs) == 56 + trials
     for run in runs:
         experiment = experiment_now(run)
         assert (experiment.env, experiment.method, experiment.recipe) == (run.env, run.curve.method, run.curve.recipe)
