@@ -220,9 +220,8 @@ def _progress(
         state = jax.vmap(advance)(task_of(book, worker.task), worker.task_state, labels, edge)
         lost = jnp.take_along_axis(state.blocked, edge[:, None], 1)[:, 0]
         return worker.task, state, state.node != worker.task_state.node, lost, jnp.zeros_like(lost)
-    tree = task_of(book, worker.task)
+    tree, jumping = task_of(book, worker.task), edge
     held = jax.vmap(holding)(tree, worker.task_state, labels)
-    jumping = edge
     if held is not None and tree.hold is not None:  # where it has not held for long enough there is no jump yet
         long_enough = jnp.take_along_axis(held >= tree.hold, edge[:, None], 1)[:, 0]
         jumping = jnp.where(long_enough, edge, TaskTree.NO_NODE)

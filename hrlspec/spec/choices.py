@@ -17,9 +17,8 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Int
 
-from hrlspec.spec.ltl.merging import Jumps
-from hrlspec.spec.ltl.translate import MAX_STATES
-from hrlspec.spec.syntax import Position, SpecError
+from hrlspec.spec.ltl.merging import Jumps, explore
+from hrlspec.spec.syntax import Position
 
 Label: TypeAlias = frozenset[str]
 Guard: TypeAlias = Callable[[Label], bool]
@@ -60,28 +59,20 @@ def with_jumps(
     """
     reached = _reached(start, states, labels)
     waits = _may_choose(reached)
-    places, numbers = [(start, 0)], {(start, 0): 0}
+    nothing = _Ways([[]] * len(labels), [])
 
-    def number(place: _Place) -> int:
-        if place not in numbers:
-            if len(places) == MAX_STATES:
-                raise SpecError(f"the automaton has more than {MAX_STATES:,} states")
-            numbers[place] = len(places)
-            places.append(place)
-        return numbers[place]
+    def after(place: _Place, label: int) -> tuple[_Place, bool]:
+        state, which = place
+        options = sorted(reached.get(state, nothing).options[label], key=lambda edge: edge.target not in waits)
+        return ((options[which].target, 0), options[which].marked) if which < len(options) else (_NOWHERE, False)
 
-    successors: list[list[int]] = []
-    marks: list[list[bool]] = []
-    jumps: list[tuple[int, ...]] = []
-    for state, which in places:  # Grows while it is read.
-        ways = reached.get(state, _Ways([[]] * len(labels), []))
-        edges = [sorted(some, key=lambda edge: edge.target not in waits)[which:][:1] for some in ways.options]
-        successors.append([number((edge[0].target, 0) if edge else _NOWHERE) for edge in edges])
-        marks.append([bool(edge and edge[0].marked) for edge in edges])
-        others = [(edge.target, 0) for edge in ways.jumps]
-        others += [(state, other) for other in range(1, max(map(len, ways.options)))]
-        jumps.append(() if which else tuple(map(number, others)))
-    return np.array(successors), np.array(marks), tuple(jumps)
+    def jumps(place: _Place) -> list[_Place]:
+        state, which = place
+        ways = reached.get(state, nothing)
+        others = [(state, other) for other in range(1, max(map(len, ways.options)))]
+        return [] if which else [(edge.target, 0) for edge in ways.jumps] + others
+
+    return explore((start, 0), after, jumps, len(labels))
 
 
 class _Ways(NamedTuple):

@@ -24,14 +24,11 @@ import dataclasses
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any, TypeAlias
 
-import numpy as np
-from jaxtyping import Bool, Int
-
 from hrlspec.spec.ltl.automaton import Automaton
-from hrlspec.spec.ltl.merging import Jumps, merged
+from hrlspec.spec.ltl.merging import explore, merged
 from hrlspec.spec.ltl.syntax import Binary, Formula, Nary, Unary
 from hrlspec.spec.ltl.text import ltl_text
-from hrlspec.spec.ltl.translate import MAX_STATES, NOTHING_OWED, Progression, labels_of
+from hrlspec.spec.ltl.translate import NOTHING_OWED, Progression, labels_of
 from hrlspec.spec.syntax import SpecError
 
 _PartState: TypeAlias = tuple[Any, ...]
@@ -154,7 +151,16 @@ def to_buchi(
     """
     labels, distinct, columns = labels_of(formula, propositions, possible_labels)
     root = _round(Progression(distinct), formula)
-    successors, marks, jumps, rejecting = merged(*_explore(root, len(distinct)))
+    start: _PartState | None = root.start
+
+    def after(state: _PartState | None, label: int) -> tuple[_PartState | None, bool]:
+        """``None`` once the formula is violated."""
+        return (None if state is None else root.after(state, label)) or (None, False)
+
+    def jumps_of(state: _PartState | None) -> Iterable[_PartState | None]:
+        return () if state is None else root.jumps(state)
+
+    successors, marks, jumps, rejecting = merged(*explore(start, after, jumps_of, len(distinct)))
     return Automaton(labels, successors[:, columns], None, rejecting, marks[:, columns], jumps if any(jumps) else ())
 
 
@@ -305,26 +311,3 @@ class _Either(_Part):
 
 def _comes_again(part: _Part) -> bool:
     return isinstance(part, _Once) and part.again
-
-
-def _explore(root: _Part, num_labels: int) -> tuple[Int[np.ndarray, "Q L"], Bool[np.ndarray, "Q L"], Jumps]:
-    """Successors, marks and jumps of all states that can be reached; state 1 is where the formula is violated."""
-    numbers, states = {root.start: 0}, [root.start, root.start]  # the second stands for the violated one
-    successors: list[list[int]] = []
-    marks: list[list[bool]] = []
-    jumps: list[tuple[int, ...]] = []
-
-    def number(state: _PartState) -> int:
-        if state not in numbers:
-            if len(states) == MAX_STATES:
-                raise SpecError(f"the formula is too large: its automaton has more than {MAX_STATES:,} states")
-            numbers[state] = len(states)
-            states.append(state)
-        return numbers[state]
-
-    for at, state in enumerate(states):  # Grows while it is read.
-        found = [None if at == 1 else root.after(state, label) for label in range(num_labels)]
-        successors.append([1 if step is None else number(step[0]) for step in found])
-        marks.append([step is not None and step[1] for step in found])
-        jumps.append(() if at == 1 else tuple(map(number, root.jumps(state))))
-    return np.array(successors), np.array(marks), tuple(jumps)

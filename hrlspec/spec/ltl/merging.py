@@ -1,17 +1,62 @@
-"""States of automata with accepting transitions: which can still accept, and which are the same.
+"""States of automata with accepting transitions: all there are, which can still accept, and which are the same.
 
 Axes: **Q** states, **L** labels.
 """
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from collections.abc import Callable, Hashable, Iterable
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Int, Int32
 
+from hrlspec.spec.ltl.translate import MAX_STATES
+from hrlspec.spec.syntax import SpecError
+
 Jumps: TypeAlias = tuple[tuple[int, ...], ...]
 """To which states each state may jump."""
+
+
+State = TypeVar("State", bound=Hashable)
+
+
+def explore(
+    start: State,
+    after: Callable[[State, int], tuple[State, bool]],
+    jumps: Callable[[State], Iterable[State]],
+    num_labels: int,
+) -> tuple[Int[np.ndarray, "Q L"], Bool[np.ndarray, "Q L"], Jumps]:
+    """Successors, marks and jumps of all states that can be reached, the first of which is the start.
+
+    Args:
+        start: the initial state.
+        after: the state after a label, by its number, and whether the transition accepts.
+        jumps: to which states one may jump.
+        num_labels: L.
+
+    Raises:
+        SpecError: there are more than `MAX_STATES`.
+    """
+    numbers, states = {start: 0}, [start]
+
+    def number(state: State) -> int:
+        if state not in numbers:
+            if len(states) == MAX_STATES:
+                raise SpecError(f"the task is too large: its automaton has more than {MAX_STATES:,} states")
+            numbers[state] = len(states)
+            states.append(state)
+        return numbers[state]
+
+    successors: list[list[int]] = []
+    marks: list[list[bool]] = []
+    targets: list[tuple[int, ...]] = []
+    for state in states:  # Grows while it is read.
+        found = [after(state, label) for label in range(num_labels)]
+        successors.append([number(target) for target, _ in found])
+        marks.append([marked for _, marked in found])
+        targets.append(tuple(map(number, jumps(state))))
+    return np.array(successors), np.array(marks), tuple(targets)
 
 
 def alive_states(
